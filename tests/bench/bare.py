@@ -24,7 +24,7 @@ from aaplug.options.shared import Orbit
 from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
-from tests.bench.scenes import CHECKPOINTS, decibels, trained
+from tests.bench.scenes import CHECKPOINTS, decibels, middle, middle_of, trained
 
 MAX_SIDE = 1000  # px: of a larger image, the middle is compared
 SCALES = {"1": 1.0, "1/2": 1 / 2, "1/4": 1 / 4, "1/8": 1 / 8, "2": 2.0, "4": 4.0}
@@ -58,7 +58,7 @@ def _figures(renderer: Renderer, views: Sequence[Camera]) -> list[Any]:
     figures: list[Any] = []
     for scale in SCALES.values():
         photographs = [_photograph(view, scale, renderer.background) for view in views]
-        images = [renderer(_middle(view.scaled(scale))).rgb for view in views]
+        images = [renderer(middle(view.scaled(scale), MAX_SIDE)).rgb for view in views]
         pairs = [(i, p) for i, p in zip(images, photographs, strict=True) if p is not None]
         figures.append(mean(decibels(*pair) for pair in pairs) if len(pairs) == len(views) else "")
     return figures
@@ -71,14 +71,4 @@ def _photograph(view: Camera, scale: float, background: Colour) -> Float[Tensor,
     photo = quantised(read_photo(view.photo, background, view.undistortion))
     if (factor := scale * view.width / photo.shape[1]) > 1:
         return None
-    small = resampled(photo, factor, view.scaled(scale).hw)
-    height, width = small.shape[:2]
-    left, top = max(0, width - MAX_SIDE) // 2, max(0, height - MAX_SIDE) // 2
-    return quantised(small[top : top + MAX_SIDE, left : left + MAX_SIDE])
-
-
-def _middle(view: Camera) -> Camera:
-    """The view's middle."""
-    width, height = min(view.width, MAX_SIDE), min(view.height, MAX_SIDE)
-    left, top = (view.width - width) // 2, (view.height - height) // 2
-    return replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
+    return quantised(middle_of(resampled(photo, factor, view.scaled(scale).hw), MAX_SIDE))

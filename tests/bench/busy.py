@@ -10,13 +10,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from statistics import median
 from tempfile import TemporaryDirectory
 
 import torch
 
 from aaplug.system.cores import WINDOW_SECONDS
-from tests.bench import heading, row
+from tests.bench import heading, row, timed
 from tests.bench.scenes import CHECKPOINTS, trained
 from tests.conftest import SHARED_DATA
 
@@ -46,12 +45,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 def milliseconds(work: Callable[[], object], repeats: int) -> float:
     """Median time of `work`, after one call that is not counted."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        work()
-        times.append(1e3 * (time.perf_counter() - start))
-    return median(times[1:])
+    return 1e3 * timed({"": work}, repeats)[""]
 
 
 @torch.no_grad()

@@ -16,9 +16,9 @@ from PIL import Image
 import aaplug
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import write_png
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes import read_scene
 from tests.bench import heading, row
-from tests.bench.viewers import FOLDER, OPENGL, PAGES, TILES, Page, shoot, write_tiles
+from tests.bench.viewers import FOLDER, OPENGL, PAGES, Page
 
 SPLAT_TRANSFORM = "splat-transform"
 PROGRAM = FOLDER / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
@@ -48,14 +48,8 @@ def _page(page: Page, shown: Path) -> Callable[[Path, Path, Path], None]:
     """A page as a program."""
 
     def program(scene: Path, camera: Path, image: Path) -> None:
-        shown.mkdir(parents=True, exist_ok=True)
-        gaussians = read_scene(scene).gaussians()
-        if page.file == TILES:
-            write_tiles(shown, gaussians)
-        else:
-            write_scene(shown / page.file, gaussians, overwrite=True)
         [view] = read_cameras(camera).train
-        write_png(image, shoot(page.name, shown, page.file, page.options, {0: view}, shown)[0])
+        write_png(image, page.shot(read_scene(scene).gaussians(), shown, {0: view}, shown)[0])
 
     return program
 

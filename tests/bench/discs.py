@@ -4,8 +4,8 @@ The chair's Gaussians are drawn as discs across their thinnest axes.  Compiled k
 `aaplug warmup --recipe 2dgs 2dgs-matched aa-2dgs` builds, which this does first where they are missing.
 """
 
-import time
 from dataclasses import replace
+from functools import partial
 from statistics import mean
 
 import torch
@@ -19,7 +19,7 @@ from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.verbs.warmup import warmup
-from tests.bench import heading, row
+from tests.bench import heading, row, timed
 from tests.bench.scenes import decibels, trained
 
 RECIPES = ("2dgs", "2dgs-matched", "aa-2dgs")
@@ -38,12 +38,8 @@ def main(rounds: int = 3, threads: int = 1) -> None:
     for recipe in RECIPES:
         kinds = [opened.renderer(recipe, rasterizer=r) for r in (RASTERIZERS["eager"], find_rasterizer("compiled"))]
         for scale in SCALES:
-            seconds = []
-            for renderer in rounds * kinds:
-                started = time.perf_counter()
-                renderer(view.scaled(scale))
-                seconds.append(time.perf_counter() - started)
-            eager, compiled = (1e3 * min(seconds[kind::2]) for kind in (0, 1))
+            works = {renderer.rasterizer.name: partial(renderer, view.scaled(scale)) for renderer in kinds}
+            eager, compiled = (1e3 * seconds for seconds in timed(works, rounds, min).values())
             row(f"`{recipe}`", f"1/{1 / scale:g}", round(eager), round(compiled), eager / compiled)
     views, discs = opened.views(2), as_discs(opened.scene)
     lighter = aaplug.lod(discs, opened.cameras, levels=3)

@@ -1,12 +1,11 @@
 """Defocus and motion blur by few samples against 1024, and what they cost."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from statistics import median
 
 import torch
 
@@ -17,7 +16,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import write_png
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
-from tests.bench import heading, row
+from tests.bench import heading, row, timed
 from tests.bench.scenes import CHECKPOINTS, trained
 from tests.conftest import SAMPLE, SHARED_DATA
 
@@ -62,7 +61,9 @@ def aperture(
                 with without_cells():
                     images["16 plain"] = renderer(of(16)).rgb
                 images["pinhole"] = renderer(view).rgb
-                ratio = _time(lambda of=of: renderer(of(16)), lambda of=of: _separate(renderer, of(16)), rounds)
+                works = {"one": partial(renderer, of(16)), "separate": partial(_separate, renderer, of(16))}
+                times = timed(works, rounds)
+                ratio = times["one"] / times["separate"]
                 figures.append([*(psnr(image, truth) or math.inf for image in images.values()), ratio])
                 if pictures is not None:
                     for word, image in {**images, "truth": truth}.items():
@@ -112,16 +113,3 @@ def _separate(renderer: Renderer, view: Camera) -> None:
     """Draw the frames of the samples one by one, as sharp views."""
     for camera in rendering.sample_cameras(view):
         renderer(replace(camera, exposure=None))
-
-
-def _time(one: Callable[[], object], other: Callable[[], object], rounds: int) -> float:
-    """Median of the ratios of their times, taken in turns."""
-    ratios = []
-    for _ in range(rounds):
-        times = []
-        for call in (one, other):
-            start = time.perf_counter()
-            call()
-            times.append(time.perf_counter() - start)
-        ratios.append(times[0] / times[1])
-    return median(ratios)

@@ -1,9 +1,8 @@
 """Lenses against pinholes and against rays: panoramas, fisheyes and distorted views, in dB and in time."""
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from statistics import median
 
 import cv2
@@ -24,7 +23,8 @@ from aaplug.io.scenes import read_scene
 from aaplug.methods.filters.matched import BY_GLOBAL_RATE
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
-from tests.bench.room import inside, matrices, room
+from tests.bench import heading, row, timed
+from tests.bench.room import inside, matrices, room, turned
 from tests.conftest import SAMPLE
 
 WIDTH = 4096  # px, of the panorama
@@ -93,14 +93,6 @@ def cube_faces(renderer: Renderer, pose: Float[Tensor, "4 4"], width: int) -> di
             common = (rays[..., 0] > math.tan(math.radians(-10))) & near
             errors["a pinhole turned by 30°"] = [float(error[common].mean())]
     return {name: -10 * math.log10(max(sum(each) / len(each), 1e-12)) for name, each in errors.items()}
-
-
-def turned(pose: Float[Tensor, "4 4"], degrees: float) -> Float[Tensor, "4 4"]:
-    """The pose, turned to the right."""
-    angle, turn = math.radians(degrees), torch.eye(4, dtype=torch.float64)
-    turn[0, 0] = turn[2, 2] = math.cos(angle)
-    turn[0, 2], turn[2, 0] = -math.sin(angle), math.sin(angle)
-    return turn @ pose
 
 
 def pixel_centres(camera: Camera) -> Float[Tensor, "h w 2"]:
@@ -190,31 +182,16 @@ def sideways(n: int = 400) -> Gaussians:
     )
 
 
-def times(draw: Callable[[], object]) -> float:
-    """Median seconds of a few runs, after one that does not count."""
-    draw()
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        draw()
-        seconds.append(time.perf_counter() - start)
-    return median(seconds)
-
-
 def main(width: int = WIDTH) -> None:
     """Print the table of the room and of the bundled chair."""
-    print(f"{'what':70}{'figure':>10}{'asked':>10}")
-
-    def row(what: str, figure: float, asked: float | None = None) -> None:
-        print(f"{what:70}{figure:10.2f}{'' if asked is None else f'{asked:10.2f}'}", flush=True)
-
+    heading("lenses", "what", "figure", "asked")
     walls, inner = room(width * 300 // WIDTH), inside(focal=width / (2 * math.pi))
     chair, views = read_scene(SAMPLE / "chair.ply").gaussians(), read_cameras(SAMPLE)
     exact, pose = Renderer.of(walls, inner, "matched"), inner.train[0].cam_from_world
     for name, figure in cube_faces(exact, pose, width).items():
-        asked = 45.0 if "within" in name else 38.0 if "whole" in name else None
+        asked = 45.0 if "within" in name else 38.0 if "whole" in name else ""
         row(f"room: faces of a panorama against pinholes, {name}, dB", figure, asked)
-    for recipe, asked in (("auto", 38.0), ("classic", None)):
+    for recipe, asked in (("auto", 38.0), ("classic", "")):
         small = Renderer.of(walls, inner, recipe)(panorama(pose, width // SMALLER)).rgb
         truth = box_average(exact(panorama(pose, width)).rgb, SMALLER)
         row(f"room, {recipe}: panorama at 1/4 against the mean of 4x4, dB", decibels(small, truth), asked)
@@ -224,6 +201,7 @@ def main(width: int = WIDTH) -> None:
         bent = distorted(Renderer.of(chair, views, "matched"), view)
         row(f"chair {view.name}: OPENCV lens against the straight view, dB", bent, 45.0)
     renderer, view = Renderer.of(chair, views, "classic", rasterizer="compiled"), views.test[0]
-    straight, around = times(lambda: renderer(view)), panorama(view.cam_from_world, width)
-    share = times(lambda: renderer(around)) / straight * view.width * view.height / (around.width * around.height)
+    around = panorama(view.cam_from_world, width)
+    times = timed({camera.name: partial(renderer, camera) for camera in (view, around)}, REPEATS)
+    share = times[around.name] / times[view.name] * view.width * view.height / (around.width * around.height)
     row("chair: time per pixel of a panorama over a pinhole view", share, 3.0)

@@ -10,6 +10,7 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from aaplug.methods.pixel_kernels.raster_rows import OPACITY, forms_at
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.finetune import finetune
-from tests.bench import discs, popping, poses, sequences
+from tests.bench import discs, popping, poses, row, sequences, timed
 from tests.bench.scenes import Trained, decibels, trained
 
 SCALES = (1 / 2, 1 / 4, 1 / 8)
@@ -88,20 +89,8 @@ def psnr(renderer: Renderer, truths: Truths) -> list[float]:
 @torch.no_grad()
 def milliseconds(renderers: Mapping[str, Renderer], view: Camera) -> dict[str, float]:
     """Least time of a view by each renderer, in turn."""
-    times = dict[str, list[float]]()
-    for turn in range(ROUNDS + 1):
-        for name, renderer in renderers.items():
-            started = time.perf_counter()
-            renderer(view)
-            if turn:  # the first loads kernels
-                times.setdefault(name, []).append(1e3 * (time.perf_counter() - started))
-    return {name: min(each) for name, each in times.items()}
-
-
-def row(name: str, *figures: float | str) -> None:
-    """Print a row."""
-    cells = [f"{each:.2f}" if isinstance(each, float) else str(each) for each in figures]
-    print(f"| {name} | {' | '.join(cells)} |")
+    works = {name: partial(renderer, view) for name, renderer in renderers.items()}
+    return {name: 1e3 * seconds for name, seconds in timed(works, ROUNDS, min).items()}
 
 
 def times(chair: Trained) -> None:

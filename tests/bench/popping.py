@@ -7,9 +7,9 @@ splats sorted again in each pixel (after StopThePop, Radl et al. 2024, arXiv 240
 pixel's ray.  The last two are eager code of this bench.
 """
 
-import time
 from dataclasses import replace
-from statistics import mean, median
+from functools import partial
+from statistics import mean
 from unittest.mock import patch
 
 import torch
@@ -31,8 +31,8 @@ from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rendering.renderer import Renderer
-from tests.bench import heading, row
-from tests.bench.scenes import decibels, trained
+from tests.bench import heading, row, timed
+from tests.bench.scenes import decibels, middle, middle_of, trained
 
 TIMED_SCALES = (1.0, 0.5, 0.25)
 DEGREES = 1.0  # of the orbit from frame to frame
@@ -69,7 +69,7 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     view, up = opened.views(1)[0], up_of(opened.cameras)
     depth = median_depth(opened.scene.means, view)
     turns = [orbit(view, frame * DEGREES / 360, depth, up) for frame in range(FRAMES)]
-    frames = [_middle(replace(turn, trained_focal=view.trained_focal), size) for turn in turns]
+    frames = [middle(replace(turn, trained_focal=view.trained_focal), size) for turn in turns]
     truth = [
         resampled(
             composited(renderer, f.resized(size * TRUTH_SAMPLES, size * TRUTH_SAMPLES), "pixel", 1.0, background),
@@ -80,9 +80,8 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     ]
     pairs = [(i, i + 1) for i in range(FRAMES - 1)]
     motion = mean(flip(truth[a], truth[b]) or 0.0 for a, b in pairs)
-    seen = [_middle(v, size) for v in opened.views(photographs)]
-    photos = [photo_at(v, v, background) for v in opened.views(photographs)]
-    photos = [photo[_start(len(photo), size) :, _start(photo.shape[1], size) :][:size, :size] for photo in photos]
+    seen = [middle(v, size) for v in opened.views(photographs)]
+    photos = [middle_of(photo_at(v, v, background), size) for v in opened.views(photographs)]
     heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "nearer", "farther", "popping", "PSNR, dB")
     for kind, shares in CASES if others else CASES[:2]:
         images = [drawn(frame, kind, shares) for frame in frames]
@@ -97,14 +96,10 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
         order: mean(decibels(paint(v).rgb.clamp(0, 1), photo_at(v, v, background)) for v in views)
         for order, paint in orders.items()
     }
-    times = {(order, scale): [] for order in orders for scale in TIMED_SCALES}
-    for _ in range(TURNS):
-        for (order, scale), taken in times.items():
-            started = time.perf_counter()
-            orders[order](view.scaled(scale))
-            taken.append(1000 * (time.perf_counter() - started))
+    works = {(order, s): partial(paint, view.scaled(s)) for order, paint in orders.items() for s in TIMED_SCALES}
+    times = timed(works, TURNS)
     for order in orders:
-        row(order, close[order], *(median(times[order, scale]) for scale in TIMED_SCALES))
+        row(order, close[order], *(1000 * times[order, scale] for scale in TIMED_SCALES))
 
 
 def composited(
@@ -162,13 +157,3 @@ def sorted_again(alpha: Tensor, ids: Tensor, depths: Tensor, window: int) -> tup
         order = torch.cat([part + start for part, start in zip(orders, starts, strict=True)], dim=1)
         alpha, ids, depths = (x.gather(1, order) for x in (alpha, ids, depths))
     return alpha, ids
-
-
-def _start(length: int, size: int) -> int:
-    return (length - size) // 2
-
-
-def _middle(view: Camera, size: int) -> Camera:
-    """The middle of a view."""
-    left, top = _start(view.width, size), _start(view.height, size)
-    return replace(view, width=size, height=size, cx=view.cx - left, cy=view.cy - top)

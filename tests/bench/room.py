@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet, look_at
@@ -65,16 +66,14 @@ def inside(side: float = SIDE, focal: float = FOCAL) -> CameraSet:
 
 def matrices(pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, "4 4"]]:
     """The poses of the six views of a cube around a camera: ahead, right, behind, left, up and down."""
-    faces = []
-    for yaw, pitch in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90)):
-        a, b = math.radians(yaw), math.radians(pitch)
-        turn, tilt = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
-        turn[0, 0] = turn[2, 2] = math.cos(a)
-        turn[0, 2], turn[2, 0] = -math.sin(a), math.sin(a)
-        tilt[1, 1] = tilt[2, 2] = math.cos(b)
-        tilt[1, 2], tilt[2, 1] = math.sin(b), -math.sin(b)
-        faces.append(tilt @ turn @ pose)
-    return faces
+    return [turned(pose, *angles) for angles in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
+
+
+def turned(pose: Float[Tensor, "4 4"], right: float, up: float = 0.0) -> Float[Tensor, "4 4"]:
+    """The pose, turned by so many degrees."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.from_numpy(Rotation.from_euler("yx", (-right, -up), degrees=True).as_matrix())
+    return turn @ pose
 
 
 def furnished(chair: Gaussians, side: float = SIDE) -> Gaussians:

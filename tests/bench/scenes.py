@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -83,3 +83,16 @@ def decibels(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> fl
     """PSNR of an image as it is stored; infinite where it is the truth."""
     ratio = psnr(quantised(image), truth)
     return math.inf if ratio is None else ratio
+
+
+def middle(view: Camera, side: int) -> Camera:
+    """The middle of a view, of so many px a side at most."""
+    width, height = min(view.width, side), min(view.height, side)
+    left, top = (view.width - width) // 2, (view.height - height) // 2
+    return replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
+
+
+def middle_of(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "H W 3"]:
+    """What `middle` shows of an image."""
+    top, left = (max(0, length - side) // 2 for length in image.shape[:2])
+    return image[top : top + side, left : left + side]

@@ -20,10 +20,9 @@ from aaplug.core.cameras import Camera
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.io.scenes import write_scene
 from aaplug.methods.viewers import VIEWERS
 from tests.bench import heading, row
-from tests.bench.viewers import PAGES, TILES, shoot, write_tiles
+from tests.bench.viewers import PAGES
 
 SIZE, FOCAL, DISTANCE = 800, 4000.0, 40.0  # px, px, units
 SIGMAS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 4.0)  # px
@@ -51,13 +50,7 @@ def main(work: Path = Path("out/single-splats"), rows: Sequence[str] = tuple(PAG
     heading("single splats", "`--for`", "adds x", "y", "opacity", "by the rule", "reaches (σ)", "smallest", "dropped")
     for name in rows:
         viewer, page = VIEWERS[name.split()[0]], PAGES[name]
-        shown = work / "shown"
-        shown.mkdir(parents=True, exist_ok=True)
-        if page.file == TILES:
-            write_tiles(shown, scene)
-        else:
-            write_scene(shown / page.file, scene, overwrite=True)
-        alpha = 1 - shoot(page.name, shown, page.file, page.options, {0: view}, work / name)[0][..., 0]
+        alpha = 1 - page.shot(scene, work / "shown", {0: view}, work / name)[0][..., 0]
         sigmas = [math.exp(step) * FOCAL / DISTANCE for step in steps]
         fits = [_fit(alpha, place) for place in places]
         bright = list(zip(sigmas, fits, strict=False))

@@ -1,13 +1,14 @@
 """Processor time of a view of the bundled chair by several recipes, in turn, both interpreted or both compiled."""
 
 import time
+from functools import partial
 from importlib.resources import as_file, files
 
 from aaplug.core.colours import WHITE
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.rendering.renderer import Renderer
-from tests.bench import heading, row
+from tests.bench import heading, row, timed
 from tests.bench.method_tables import keep
 
 RECIPES: dict[str, tuple[str, ...]] = {"eager": ("classic", "ewa", "mip", "sa-gs", "matched", "analytic")}
@@ -23,12 +24,8 @@ def main() -> None:
     heading("times", *lines[0])
     for rasterizer, recipes in RECIPES.items():
         drawn = {name: Renderer.of(scene, cameras, name, background=WHITE, rasterizer=rasterizer) for name in recipes}
-        least = dict.fromkeys(recipes, float("inf"))
-        for _ in range(ROUNDS[rasterizer]):
-            for name, renderer in drawn.items():
-                start = time.process_time()
-                renderer(view)
-                least[name] = min(least[name], time.process_time() - start)
+        works = {name: partial(renderer, view) for name, renderer in drawn.items()}
+        least = timed(works, ROUNDS[rasterizer], min, time.process_time)
         lines += [(rasterizer, name, f"{1000 * seconds:.1f}") for name, seconds in least.items()]
     for line in lines[1:]:
         row(*line)

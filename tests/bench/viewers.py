@@ -63,6 +63,18 @@ class Page:
     off: Mapping[str, Any] | None = None
     file: str = "scene.ply"
 
+    def shot(
+        self, scene: Gaussians, shown: Path, views: Mapping[Any, Camera], work: Path
+    ) -> dict[Any, Float[Tensor, "h w 3"]]:
+        """What it draws of a scene, by view.  shown, work: folders of the scene and of the pictures."""
+        shown.mkdir(parents=True, exist_ok=True)
+        if self.file == TILES:
+            write_level(shown, "3dtiles", 0, [scene])  # as one tile
+            write_index(shown, "3dtiles", 1, 1.0)
+        else:
+            write_scene(shown / self.file, scene, overwrite=True)
+        return shoot(self.name, shown, self.file, self.options, views, work)
+
 
 def _mkkellogg(**options: Any) -> Page:
     usual = {"sphericalHarmonicsDegree": 2}
@@ -163,7 +175,8 @@ class Bench:
 
     def cells(self, viewer: Viewer | None, scene: Gaussians, page: Page) -> list[str]:
         """PSNR against photographs at each scale and, for a viewer, against its prediction."""
-        pictures = self.pictures(scene, page)
+        views = {(v.name, s): v.scaled(s) for v in self.views for s in SCALES}
+        pictures = page.shot(scene, self.work / "shown", views, self.work)
         cells = []
         for scale in SCALES:
             drawn = [pictures[view.name, scale] for view in self.views]
@@ -175,23 +188,6 @@ class Bench:
                 cell += f" ({_mean(drawn, predicted):.1f})"
             cells.append(cell)
         return cells
-
-    def pictures(self, scene: Gaussians, page: Page) -> dict[tuple[str, float], Float[Tensor, "h w 3"]]:
-        """What a page draws, by view and scale."""
-        shown = self.work / "shown"
-        shown.mkdir(exist_ok=True)
-        if page.file == TILES:
-            write_tiles(shown, scene)
-        else:
-            write_scene(shown / page.file, scene, overwrite=True)
-        views = {(v.name, s): v.scaled(s) for v in self.views for s in SCALES}
-        return shoot(page.name, shown, page.file, page.options, views, self.work)
-
-
-def write_tiles(folder: Path, scene: Gaussians) -> None:
-    """Write a scene as one tile."""
-    write_level(folder, "3dtiles", 0, [scene])
-    write_index(folder, "3dtiles", 1, 1.0)
 
 
 def shoot(
