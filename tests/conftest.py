@@ -6,10 +6,11 @@
 import json
 import logging
 import math
+import multiprocessing
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -184,6 +185,14 @@ def browser():
 def click(box: Any) -> None:
     """Click a box of a page itself: a picture that arrives may move it away from under a mouse."""
     box.dispatch_event("click")
+
+
+def exit_code(work: Callable[[], object]) -> int | None:
+    """That of a copy of this process which does the work; negative where a signal ended it."""
+    child = multiprocessing.get_context("fork").Process(target=work)
+    child.start()
+    child.join(120)
+    return child.exitcode
 
 
 MEASURE = """

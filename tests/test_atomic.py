@@ -1,13 +1,11 @@
 """Outputs appear whole or not at all, and never in place of an input."""
 
 import errno
-import multiprocessing
 import os
 import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import pytest
 from aaplug.io.atomic import check_output, claimed, output_folder, replacing, writing
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
+from tests.conftest import exit_code
 
 OLD, NEW = b"old", b"new and longer"
 
@@ -130,13 +129,6 @@ def test_checking_creates_nothing(output: Path):
     with pytest.raises(OutputError, match="exists"):
         check_output(output, False)
     assert only_the_old_file_is_there(output)
-
-
-def exit_code(work: Callable[[], None]) -> int | None:
-    child = multiprocessing.get_context("fork").Process(target=work)
-    child.start()
-    child.join(30)
-    return child.exitcode
 
 
 def killed(path: Path, at: str) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement, Report
-from aaplug.io.atomic import claimed
 from aaplug.io.batch_file import read_batch
 from aaplug.system.errors import ClusterError, FormatError, UsageError
 from aaplug.verbs.batch import batch as evaluate_all
@@ -247,15 +246,6 @@ def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_o
     found = evaluate_all([("x", refused), ("y", refused)], tmp_path / "out", resume=True)
     assert len(found.failures) == 2
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()} == before
-
-
-def test_two_batches_do_not_share_a_folder(batch):
-    assert batch("evaluate --batch batch.toml")[0] == 1
-    before = Path("out/batch.json").read_bytes()
-    with claimed("out"):
-        code, _, err = batch("evaluate --batch batch.toml --resume")
-    assert (code, "out: is being written by another process" in err) == (2, True)
-    assert Path("out/batch.json").read_bytes() == before
 
 
 MANY = """

@@ -2,10 +2,9 @@
 
 import contextlib
 import json
+import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,6 +14,7 @@ from aaplug_cli.main import main
 from aaplug.core.conventions import MIP
 from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
+from tests.conftest import exit_code
 
 TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
@@ -88,18 +88,17 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
     assert reports[0]["curve"] == reports[1]["curve"]
 
 
-def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole):
-    program = (
-        "import os, sys; from aaplug.finetuning import loop; from aaplug_cli.main import main\n"
-        "real = loop.advance\n"
-        "def advance(job, state):\n"
-        "    if state.step == 2: os.kill(os.getpid(), 9)\n"
-        "    real(job, state)\n"
-        "loop.advance = advance\n"
-        "main(sys.argv[1:])"
-    )
-    words = [sys.executable, "-c", program, *RUN.split()]
-    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == -9
+def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, monkeypatch, whole):
+    real = loop.advance
+
+    def killed(job, state):
+        if state.step == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        real(job, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "advance", killed)
+        assert exit_code(lambda: main(RUN.split())) == -signal.SIGKILL
     assert not Path("tuned.ply").exists()
     code, _, err = cli(f"{RUN} --resume")
     assert (code, "resumed at step 2" in err) == (0, True)

@@ -4,8 +4,8 @@ import csv
 import json
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.system.executors import ProcessesIfLong
+from aaplug.system.executors import load, save
 from tests.conftest import EYES, make_scene
 from tests.scene_files import DATA
 
@@ -243,12 +243,19 @@ def test_bad_input_is_one_line(cli, words):
     assert REFUSED[words] in err.splitlines()[-1]
 
 
-def test_files_and_a_continued_run(cli, monkeypatch):
+@pytest.fixture
+def texts(monkeypatch):
+    """What is written into pictures, in order."""
+    texts = []
+    monkeypatch.setattr("cv2.putText", lambda sheet, text, *rest: texts.append(text))
+    return texts
+
+
+def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
-    real, added, texts = Journal.add, [], list[str]()
-    monkeypatch.setattr("cv2.putText", lambda sheet, text, *rest: texts.append(text))
+    real, added = Journal.add, []
 
     def stopping(self, view, measurements):
         if len(added) == 2:
@@ -279,14 +286,6 @@ def test_files_and_a_continued_run(cli, monkeypatch):
     assert width > height > 3 * 320
 
 
-@pytest.fixture
-def texts(monkeypatch):
-    """What is written into pictures, in order."""
-    texts = []
-    monkeypatch.setattr("cv2.putText", lambda sheet, text, *rest: texts.append(text))
-    return texts
-
-
 def test_pictures_hold_no_sign_that_the_font_lacks(texts):
     image = torch.zeros(400, 400, 3)
     labelled(image, "4× – é ∞ 日")
@@ -311,12 +310,18 @@ def test_an_error_map_runs_from_black_to_the_end_of_the_scale():
         torch.testing.assert_close(pixel, torch.tensor(colour, dtype=torch.float32))
 
 
-def test_views_measured_in_processes_are_the_same(cli, monkeypatch):
+def test_views_measured_in_processes_are_the_same(cli, monkeypatch, tmp_path):
+    """What goes to them comes back from a file, as in each of them."""
+
+    def sent(work, items):
+        save(work, tmp_path / "work.pt")
+        return map(load(tmp_path / "work.pt"), items)
+
     scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     given = {"a": scene, "b": replace(scene, convention=MIP)}
     how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
     expected = aaplug.compare(given, cameras, **how).report
-    monkeypatch.setattr("aaplug.verbs.compare.ProcessesIfLong", partial(ProcessesIfLong, pays_after=0.0))
+    monkeypatch.setattr("aaplug.verbs.compare.ProcessesIfLong", lambda threads: SimpleNamespace(map=sent))
     found = aaplug.compare(given, cameras, **how).report
     assert [m.values for m in found.measurements] == [m.values for m in expected.measurements]
 

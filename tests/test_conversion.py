@@ -56,7 +56,9 @@ def test_what_cannot_be_fused_is_refused(cameras):
             fuse(converted, training, form)
 
 
-@pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
+@pytest.mark.parametrize(
+    "viewer", {viewer.convention: viewer for viewer in VIEWERS.values()}.values(), ids=lambda v: v.name
+)
 @pytest.mark.parametrize("trained", CONVENTIONS.values(), ids=CONVENTIONS)
 def test_converted_for_a_viewer_shows_the_energy_that_training_showed(viewer, trained):
     """With one camera and splats wide enough, the viewer's o√det and width are those of training."""

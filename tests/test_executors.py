@@ -301,7 +301,7 @@ class Draw:
 
 if __name__ == "__main__":
     torch.set_num_threads(2)
-    scene, camera = synthetic_scene(2000), synthetic_camera(300, 200)
+    scene, camera = synthetic_scene(1000), synthetic_camera(150, 100)
     renderers = [Renderer.of(scene, [camera], "classic", rasterizer=name).portable() for name in ("eager", "auto")]
     draw = Draw(renderers, [camera, camera.scaled(0.5), camera.scaled(0.25)])
     items = range(6)

@@ -1,10 +1,12 @@
 """Many frames: the same files whatever the number of processes."""
 
+from pathlib import Path
+
 import pytest
 
+from aaplug.io.image_formats import Storage
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import OutputError
 from aaplug.system.executors import ProcessesIfLong, torch_threads
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
@@ -23,21 +25,16 @@ def paths(tmp_path):
 
 
 def test_files_are_the_same_whatever_the_number_of_processes(renderer, paths):
-    files, progress = [], []
+    storage = Storage.of(Path("a.npz"), passes=("rgb", "alpha", "depth", "normal", "id"))
+    files, progress, paths = [], [], [path.with_suffix(".npz") for path in paths]
     for threads in (1, 2):
         apply = ProcessesIfLong(threads, pays_after=0.0).map
-        write_frames(renderer, VIEWS, paths, apply, overwrite=threads == 2, tell=lambda *now: progress.append(now))
+        how = {"storage": storage, "overwrite": threads == 2, "tell": lambda *now: progress.append(now)}
+        write_frames(renderer, VIEWS, paths, apply, **how)
         files.append([path.read_bytes() for path in paths])
     assert files[0] == files[1]
     assert len(set(files[0])) == len(VIEWS)
     assert progress == 2 * [(done, 4) for done in range(5)]
-
-
-def test_an_existing_file_is_refused_by_name(renderer, paths):
-    paths[3].write_bytes(b"mine")
-    with pytest.raises(OutputError, match=r"v3\.png: exists"):
-        write_frames(renderer, VIEWS, paths)
-    assert paths[3].read_bytes() == b"mine"
 
 
 def test_little_work_starts_no_process(renderer, paths, monkeypatch):

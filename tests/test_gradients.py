@@ -1,6 +1,6 @@
 """Gradients of an image in a scene and a pose, against finite differences.
 
-The laws of pixel kernels compare them with the reference's.
+The laws of pixel kernels compare them with the reference's, and those of screen filters with their formulas.
 """
 
 from dataclasses import replace
@@ -11,16 +11,12 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.methods import RECIPES, SCREEN_FILTERS, WORLD_FILTERS
-from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods import RECIPES, WORLD_FILTERS
 from aaplug.methods.recipe import Recipe
-from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene, make_splats, sized
+from tests.conftest import make_camera, make_scene, sized
 
 F64 = torch.float64
 STEP = 1e-6
@@ -30,12 +26,8 @@ CAMERA = make_camera((0.5, -3.5, 0.4), size=(28, 20))
 # a free pose: at a training pose the range of rates ends at the view itself, which is a kink
 VIEW = replace(make_camera((0.7, -3.4, 0.2), size=(28, 20)), trained_focal=None).scaled(0.75)
 TRAINING = TrainingViews.of(SCENE, [CAMERA, make_camera((2.0, -3.0, 1.0), size=(28, 20))])
-TILED, BLACK = Tiled(), (0.0, 0.0, 0.0)
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "pose")
-SCREENS = {f"screen {name}": Recipe(name, screen, "", "") for name, screen in SCREEN_FILTERS.items()}
-WORLDS = {
-    f"world {name}": Recipe(name, SCREEN_FILTERS["mip"], "", "", world=world) for name, world in WORLD_FILTERS.items()
-}
+WORLDS = {f"world {name}": replace(RECIPES["mip"], world=world) for name, world in WORLD_FILTERS.items()}
 SAMPLED = {"samples": replace(RECIPES["sa-gs"], target_rate=1.0)}
 
 
@@ -47,7 +39,7 @@ def arguments(recipe: Recipe) -> tuple[object, ...]:
     )
 
 
-NAMED = {f"recipe {name}": recipe for name, recipe in RECIPES.items()} | SCREENS | WORLDS | SAMPLED
+NAMED = {f"recipe {name}": recipe for name, recipe in RECIPES.items()} | WORLDS | SAMPLED
 NAMES_BY_ARGUMENTS = {arguments(recipe): name for name, recipe in NAMED.items()}  # one name where several are alike
 DIFFERENT = {name: NAMED[name] for name in NAMES_BY_ARGUMENTS.values()}
 
@@ -62,7 +54,7 @@ def loss(recipe: Recipe, values: dict[str, Tensor]) -> Tensor:
     scene: Gaussians = replace(SCENE, **{n: v for n, v in values.items() if n != "pose"})
     view: Camera = replace(VIEW, cam_from_world=values["pose"])
     background = (0.1, 0.5, 0.9)
-    image = Renderer.of(scene, TRAINING, recipe, rasterizer=TILED, background=background)(view)
+    image = Renderer.of(scene, TRAINING, recipe, rasterizer=Tiled(), background=background)(view)
     weights = torch.rand(*view.hw, 4, generator=torch.Generator().manual_seed(1), dtype=F64)
     return (torch.cat([image.rgb, image.alpha[..., None]], dim=2) * weights.to(image.rgb)).sum()
 
@@ -92,18 +84,3 @@ def test_gradients_are_finite_differences(recipe):
     ends = [loss(chosen, {n: fixed[n] + sign * steps[n] for n in NAMES}).item() for sign in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * STEP)
     assert slope == pytest.approx(len(NAMES) * least, rel=RELATIVE / len(NAMES)), slopes
-
-
-def splat_gradients(rasterizer: Rasterizer, splats: Splats2D, hw: tuple[int, int]) -> tuple[Tensor, ...]:
-    names = ("means", "covs", "dets", "opacities", "rgb")
-    values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
-    image = rasterizer(replace(splats, **values), hw, BLACK, POINT)
-    return torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values()))
-
-
-def test_gradients_of_stacked_capped_and_faint_splats_are_those_of_the_reference():
-    hw = (17, 26)
-    splats = make_splats(400, hw, seed=2).to(F64)
-    splats = replace(splats, opacities=splats.opacities.sqrt())
-    gradients = (splat_gradients(rasterizer, splats, hw) for rasterizer in (TILED, Reference()))
-    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)

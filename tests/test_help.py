@@ -57,11 +57,14 @@ def test_help_lists_each_verb_with_its_first_line_only(cli):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
-    usage, about = HEADING.split(cli(f"{verb} --help")[1])[0].strip().split("\n", 1)
+    text = cli(f"{verb} --help")[1]
+    usage, about = HEADING.split(text)[0].strip().split("\n", 1)
     assert usage.startswith(f"usage: aaplug {verb} ")
     first, when = about.strip().split("\n\n")
     assert first == VERBS[verb].help.splitlines()[0]
     assert any(re.search(rf"\b{other}\b", when) for other in VERBS if other != verb), when
+    assert ("path file" in text) == (verb in ("render", "video"))
+    assert "guides/" not in text, "a guide's file, which the wheel lacks"
 
 
 def test_render_shows_few_options_before_those_with_a_heading(cli):
@@ -71,11 +74,6 @@ def test_render_shows_few_options_before_those_with_a_heading(cli):
     assert headings[:3] == ["positional arguments", "options", "scene file options"]
     assert {"[SCENE", "-h", "-o", "--cameras", "--scale"} <= set(options)
     assert len(options) <= 15
-
-
-def test_pictures_and_videos_have_a_path_file(cli):
-    for verb in VERBS:
-        assert ("path file" in cli(f"{verb} --help")[1]) == (verb in ("render", "video"))
 
 
 def test_a_refused_word_ends_in_one_stop(cli):
@@ -101,11 +99,10 @@ def test_a_guide_is_drawn_on_a_terminal_and_long_words_keep_their_ends(cli, monk
     assert "…" not in out
 
 
-def test_texts_name_guides_that_are_there_and_not_their_files(cli):
+def test_texts_name_guides_that_are_there_and_not_their_files():
     sources = [*(ROOT / "aaplug").rglob("*.py"), *(ROOT / "cli").glob("*.py"), ROOT / "README.md", *GUIDES]
     named = re.findall(r"`aaplug guide (\w+)`", "".join(path.read_text() for path in sources))
     assert {"cluster", "methods", "viewers"} <= set(named) <= {path.stem for path in GUIDES}
-    assert not any("guides/" in cli(f"{verb} --help")[1] for verb in VERBS)
 
 
 def test_the_table_of_recipes_has_every_one_and_marks_those_for_comparison(cli, monkeypatch):

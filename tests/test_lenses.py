@@ -276,19 +276,19 @@ def test_a_pixel_of_a_plane_has_the_area_of_the_images_own(lens):
     torch.testing.assert_close(splats.rates, area.sqrt() / 1e-6, rtol=1e-3, atol=0.0)
 
 
-@pytest.mark.parametrize("rasterizer", ["eager", *({"compiled"} & ALL_RASTERIZERS.keys())])
-def test_tiles_draw_through_a_lens_what_the_reference_does(lens, rasterizer):
-    scene = make_scene(300)
+def test_tiles_draw_through_a_lens_what_the_reference_does(lens):
+    scene, camera = make_scene(300), view_through(lens, side=48)
     training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0))])
-    camera = view_through(lens)
-    tiles, exact = (
-        Renderer.of(scene, training, "matched", rasterizer=ALL_RASTERIZERS[name])(camera)
-        for name in (rasterizer, "reference")
-    )
+    drawn = {
+        name: Renderer.of(scene, training, "matched", rasterizer=rasterizer)(camera)
+        for name, rasterizer in ALL_RASTERIZERS.items()
+    }
+    exact = drawn.pop("reference")
     assert exact.alpha.mean() > 0.2
-    error = (tiles.rgb.double() - exact.rgb).abs()
-    assert error.max() < RULES_3DGS.min_alpha  # rounding can carry an alpha across the cut-off
-    assert error.mean() < 1e-6
+    for name, tiles in drawn.items():
+        error = (tiles.rgb.double() - exact.rgb).abs()
+        assert error.max() < RULES_3DGS.min_alpha, name  # rounding can carry an alpha across the cut-off
+        assert error.mean() < 1e-6, name
 
 
 def big_and_small(n: int = 400) -> Gaussians:
@@ -298,8 +298,8 @@ def big_and_small(n: int = 400) -> Gaussians:
 
 
 def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
-    camera = view_through(lens, side=128)
-    splats = project(big_and_small(), camera).blurred(0.3, compensate=False)
+    camera = view_through(lens, side=96)
+    splats = project(big_and_small(200), camera).blurred(0.3, compensate=False)
     ellipses = RAY.bounding_ellipses(splats, RULES_3DGS)
     assert ellipses is not None
     y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in camera.hw), indexing="ij")
@@ -309,20 +309,11 @@ def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
         alpha = own.opacities * RAY.exact(own, pixels[:, None] - own.means)
         drawn = alpha >= RULES_3DGS.min_alpha
         turn = camera.fx * lens.period
-        offsets = pixels[:, None] - around.means
+        x, y = (pixels[:, None] - around.means).unbind(dim=2)
         xx, xy, yy = around.covs.unbind(dim=1)
-        shifts = (0.0,) if not turn else (-turn, 0.0, turn)
-        nearest = torch.stack(
-            [
-                (
-                    yy * (offsets[..., 0] + s) ** 2
-                    - 2 * xy * (offsets[..., 0] + s) * offsets[..., 1]
-                    + xx * offsets[..., 1] ** 2
-                )
-                / around.dets
-                for s in shifts
-            ]
-        ).amin(dim=0)
+        across = [x + shift for shift in ((-turn, 0.0, turn) if turn else (0.0,))]
+        squares = [(yy * dx**2 - 2 * xy * dx * y + xx * y**2) / around.dets for dx in across]
+        nearest = torch.stack(squares).amin(dim=0)
         reach = 2 * (own.opacities / RULES_3DGS.min_alpha).log()
         assert (nearest <= reach)[drawn].all()
 

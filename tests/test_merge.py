@@ -75,14 +75,11 @@ def test_a_mixed_scene_looks_like_its_parts(sample_scene, sample_cameras, sample
         there = moved_cameras(sample_cameras, move)
         alone = own_look(part, TrainingViews.of(part, sample_cameras), background=WHITE)
         whole = own_look(merged, TrainingViews.of(merged, there), background=WHITE)
-        errors = []
-        for view, same in list(zip(sample_cameras.test, there.test, strict=True))[:2]:
-            small, same = view.scaled(0.5), same.scaled(0.5)
-            truth = photo_at(view, small, WHITE)
-            images = alone(small).rgb.clamp(0, 1), whole(same).rgb.clamp(0, 1)
-            errors.append([float((image - truth).square().mean().log10() * 10) for image in images])
-        lost = torch.tensor(errors).mean(dim=0).diff().item()
-        assert lost < 0.5, (part.convention.name, lost)
+        view, same = (cameras.test[0].scaled(0.25) for cameras in (sample_cameras, there))
+        truth = photo_at(sample_cameras.test[0], view, WHITE)
+        images = alone(view).rgb.clamp(0, 1), whole(same).rgb.clamp(0, 1)
+        errors = torch.stack([(image - truth).square().mean().log10() * 10 for image in images])
+        assert errors.diff() < 0.5, part.convention.name
 
 
 def test_degrees_records_and_places_are_brought_together():

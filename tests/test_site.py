@@ -17,7 +17,7 @@ from tests.bench.claims import PAGE as PAGE_OF_CLAIMS
 from tests.bench.claims import page as claims_page
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
-from tests.bench.theory import CELLS, LARGEST_THIRD, error, laws
+from tests.bench.theory import laws
 from tests.bench.viewers import shown_table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,12 +87,6 @@ def test_a_figure_of_tables_or_formulas_is_the_committed_one(plot, least):
     drawn, committed = curves(plot.svg()), curves((FOLDER / f"{plot.name}.svg").read_text())
     assert drawn == committed
     assert len(drawn) >= least
-
-
-def test_halving_the_cells_of_a_merge_costs_eight_times_less_error():
-    """The curve of theory.md, statement 6."""
-    assert error(1 / 8) / error(1 / 16) == pytest.approx(8, rel=0.1)
-    assert all(error(cell) < LARGEST_THIRD * cell**3 / 6 for cell in CELLS)
 
 
 def test_each_plot_is_asked_for_once_and_names_its_files_their_command_and_commit(hooks):

@@ -13,6 +13,7 @@ from aaplug.core.splats import Splats2D
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.rendering.renderer import Renderer
+from tests.bench.theory import CELLS, LARGEST_THIRD, error
 from tests.conftest import splats_of, straight_camera
 
 F64 = torch.float64
@@ -72,17 +73,6 @@ def test_two_levels_together_keep_the_light_of_one(share):
 
 
 def test_merging_by_moments_errs_in_the_third_order():
-    """Statement 6: half the cell, an eighth of the error, where weights differ; pixel filter of deviation 1."""
-    x = torch.linspace(-8, 8, 4001, dtype=F64)
-
-    def bell(place: float, variance: float) -> Tensor:
-        return torch.exp(-((x - place) ** 2) / (2 * variance)) / math.sqrt(variance)
-
-    def error(cell: float) -> float:
-        weights, places = (0.8, 0.2), (0.0, cell)
-        mean = sum(w * d for w, d in zip(weights, places, strict=True))
-        spread = sum(w * (d - mean) ** 2 for w, d in zip(weights, places, strict=True))
-        mixture = sum(w * bell(d, 1.0) for w, d in zip(weights, places, strict=True))
-        return float((mixture - bell(mean, 1.0 + spread)).abs().max())
-
-    assert error(0.5) / error(0.25) == pytest.approx(8, rel=0.1)
+    """Statement 6: half the cell, an eighth of the error, and the figure's bound."""
+    assert error(1 / 8) / error(1 / 16) == pytest.approx(8, rel=0.1)
+    assert all(error(cell) < LARGEST_THIRD * cell**3 / 6 for cell in CELLS)
