@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -119,19 +119,47 @@ def make_dataset(folder: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def cli(dataset, tmp_path, monkeypatch, capsys):
-    """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
-    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
+@dataclass(frozen=True)
+class Program:
+    """The program, in this process; gives (exit code, stdout, stderr)."""
 
-    def run(words: str) -> tuple[int, str, str]:
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, words: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as stop:
             main(words.split())
-        printed = capsys.readouterr()
+        printed = self.capsys.readouterr()
         return int(stop.value.code or 0), printed.out, printed.err
 
-    return run
+    def done(self, words: str) -> tuple[str, str]:
+        """What a run prints that succeeds, (stdout, stderr)."""
+        code, out, err = self(words)
+        assert code == 0, err
+        return out, err
+
+    def refused(self, words: str, *said: str) -> str:
+        """The line in which a run is refused, which says that; no file is written or changed."""
+        before = times_of_files()
+        code, out, err = self(words)
+        assert (code, out) == (2, ""), err
+        last = err.rstrip("\n").split("\n")[-1]
+        assert last.startswith("error: ")
+        assert all(text in last for text in said), last
+        assert times_of_files() == before
+        return last
+
+
+def times_of_files() -> dict[Path, int | None]:
+    """When each file in this folder was changed; of folders only that they are there, as claims come and go."""
+    return {path: path.stat().st_mtime_ns if path.is_file() else None for path in Path().rglob("*")}
+
+
+@pytest.fixture
+def cli(dataset, tmp_path, monkeypatch, capsys) -> Program:
+    """The program in a fresh folder holding a copy of the data set."""
+    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return Program(capsys)
 
 
 _drawn: dict[tuple[str, str, str], bytes] = {}

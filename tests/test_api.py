@@ -26,7 +26,7 @@ def test_python_in_the_readme_gives_the_command_lines_image(cli):
     Path("readme.py").write_text(found[1])
     image = runpy.run_path("readme.py")["image"]
     words = "render scene.ply --cameras path/to/colmap --views r_8 -o one.png --scale 0.25"
-    assert cli(f"{words} --bit-depth 16")[0] == 0
+    cli.done(f"{words} --bit-depth 16")
     aaplug.write_png("two.png", image, bit_depth=16)
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
     assert image[0, 0].min() == 1  # the chair's cameras say white
@@ -37,7 +37,7 @@ def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):
     scene, cameras = aaplug.read_scene("scene.ply").gaussians(), aaplug.read_cameras(".")
     image = aaplug.Renderer.of(scene, cameras, recipe)(cameras.test[0].scaled(0.5)).rgb
     words = f"render scene.ply --cameras . -o one.png --scale 0.5 --recipe {recipe}"
-    assert cli(f"{words} --bit-depth 16")[0] == 0
+    cli.done(f"{words} --bit-depth 16")
     aaplug.write_png("two.png", image, bit_depth=16)
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
 

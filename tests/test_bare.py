@@ -208,10 +208,8 @@ def test_the_orbit_of_levels_of_detail_is_that_of_the_finest():
 
 
 def test_a_bare_folder_of_levels_is_shown(cli):
-    code, _, err = cli(f"lod scene.ply -o levels --levels 2 --no-refine {SMALL}")
-    assert code == 0, err
-    code, _, err = cli(f"render levels -o image.png --scale 0.3 {SMALL}")
-    assert code == 0, err
+    cli.done(f"lod scene.ply -o levels --levels 2 --no-refine {SMALL}")
+    _, err = cli.done(f"render levels -o image.png --scale 0.3 {SMALL}")
     assert "with half that rate the image would be" in err
     assert json.loads(cli(f"info levels --json {SMALL}")[1])["training_rate"].startswith("assumed as of 48x36 px")
 
@@ -229,13 +227,13 @@ def test_an_image_of_a_bare_file(cli):
 
 
 def test_an_orbit_of_a_bare_file(cli):
-    assert cli(f"render scene.ply -o all {SMALL} --recipe classic")[0] == 0
+    cli.done(f"render scene.ply -o all {SMALL} --recipe classic")
     assert len(list(Path("all").iterdir())) == 8
-    assert cli(f"render scene.ply -o three {SMALL} --orbit 3 --elevation -10 --up 0,0,1 --recipe classic")[0] == 0
+    cli.done(f"render scene.ply -o three {SMALL} --orbit 3 --elevation -10 --up 0,0,1 --recipe classic")
     assert [path.name for path in sorted(Path("three").iterdir())] == ["orbit_0.png", "orbit_1.png", "orbit_2.png"]
-    assert cli(f"render scene.ply -o one {SMALL} --eye 0 -4 0 --look-at -0.5 0 0 --up 0 0 -1 --recipe classic")[0] == 0
+    cli.done(f"render scene.ply -o one {SMALL} --eye 0 -4 0 --look-at -0.5 0 0 --up 0 0 -1 --recipe classic")
     assert image_size(Path("one/eye.png")) == (48, 36)
-    assert cli(f"render --eye -0.5,-4,0 --up 0 0 -1 scene.ply -o after {SMALL} --recipe classic")[0] == 0
+    cli.done(f"render --eye -0.5,-4,0 --up 0 0 -1 scene.ply -o after {SMALL} --recipe classic")
 
 
 @pytest.mark.parametrize(
@@ -252,8 +250,7 @@ def test_an_orbit_of_a_bare_file(cli):
     ],
 )
 def test_every_verb_takes_a_bare_file(cli, words):
-    code, _, err = cli(words)
-    assert code == 0, err
+    _, err = cli.done(words)
     assert list(Path().glob("new*"))
     assert "training rate: assumed as of 48x36 px from the orbit" in err
 
@@ -265,15 +262,14 @@ def test_a_path_of_ones_own_keeps_its_field_of_view(cli, monkeypatch):
     drawn = []
     draw = Renderer.__call__
     monkeypatch.setattr(Renderer, "__call__", lambda self, camera: drawn.append(camera) or draw(self, camera))
-    code, _, err = cli(f"video scene.ply -o new.webm --path path.json --resolution 40x60 {SMALL}")
-    assert code == 0, err
+    cli.done(f"video scene.ply -o new.webm --path path.json --resolution 40x60 {SMALL}")
     assert {camera.fy / camera.fx for camera in drawn} == {2.0}
 
 
 def test_large_files_are_converted_in_parts_without_cameras(cli, monkeypatch):
-    assert cli("convert scene.ply -o whole.ply")[0] == 0
+    cli.done("convert scene.ply -o whole.ply")
     monkeypatch.setattr("aaplug.verbs.convert.LARGE_SCENE", 100)
-    assert cli("convert scene.ply -o parts.ply")[0] == 0
+    cli.done("convert scene.ply -o parts.ply")
     assert Path("parts.ply").read_bytes() == Path("whole.ply").read_bytes()
 
 
@@ -300,17 +296,15 @@ def test_needles_are_counted(tmp_path):
 
 def test_a_scene_of_nothing_is_refused(cli):
     write_scene("empty.ply", make_scene(0))
-    code, _, err = cli("render empty.ply -o new")
-    assert (code, "empty.ply: has no Gaussians to look at" in err) == (2, True)
-    assert cli("info empty.ply")[0] == 0
+    cli.refused("render empty.ply -o new", "empty.ply: has no Gaussians to look at")
+    cli.done("info empty.ply")
 
 
 @pytest.mark.parametrize("count", [1, 30])
 def test_a_scene_in_one_place_is_shown(cli, count):
     scene = make_scene(count)
     write_scene("point.ply", replace(scene, means=torch.full_like(scene.means, 2.0)))
-    code, _, err = cli("render point.ply -o new.png --resolution 30x30 --background white")
-    assert code == 0, err
+    cli.done("render point.ply -o new.png --resolution 30x30 --background white")
     assert read_image(Path("new.png"), None).std() > 0.01
 
 

@@ -29,12 +29,12 @@ def test_render_writes_a_view_at_a_scale(cli):
 
 @pytest.mark.parametrize(("resolution", "size"), [("40x40", (40, 40)), ("-1x24", (32, 24)), ("128x-1", (128, 96))])
 def test_render_writes_a_resolution(cli, resolution, size):
-    assert cli(f"render scene.ply --cameras . -o one.png --resolution {resolution}")[0] == 0
+    cli.done(f"render scene.ply --cameras . -o one.png --resolution {resolution}")
     assert image_size(Path("one.png")) == size
 
 
 def test_render_writes_16_bits(cli):
-    assert cli("render scene.ply --cameras . -o one.png --bit-depth 16")[0] == 0
+    cli.done("render scene.ply --cameras . -o one.png --bit-depth 16")
     pixels = cv2.imread("one.png", cv2.IMREAD_UNCHANGED)
     assert pixels.dtype == np.uint16
     assert len(np.unique(pixels)) > 256
@@ -51,18 +51,16 @@ def test_render_selects_views(cli):
 
 
 def test_render_one_file_of_cameras_serves_as_both(cli):
-    assert cli("render scene.ply --cameras transforms_test.json -o one.png")[0] == 0
+    cli.done("render scene.ply --cameras transforms_test.json -o one.png")
 
 
 def test_render_takes_an_inria_model_folder_as_it_is(cli):
     model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
-    code, _, err = cli(f"render -m {model} -o out --views all")
-    assert (code, "background: white (from the camera files)" in err) == (0, True)
+    assert "background: white (from the camera files)" in cli.done(f"render -m {model} -o out --views all")[1]
     assert cv2.imread("out/a.png")[0, 0].min() > 200
     assert image_size(Path("out/a.png")) == (32, 24)  # cameras.json holds the source's size; training was at -r 2
-    assert cli(f"render {model} -o again --iteration 7 --views a")[0] == 0
-    code, _, err = cli(f"render {model} -o again --iteration 8 --views a --overwrite")
-    assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
+    cli.done(f"render {model} -o again --iteration 7 --views a")
+    cli.refused(f"render {model} -o again --iteration 8 --views a --overwrite", "has no iteration 8; it has 7, 30")
 
 
 def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
@@ -160,24 +158,12 @@ REFUSED = {
 def test_broken_files_are_refused_and_nothing_is_written(cli, case):
     spoil, words, named = BROKEN[case]
     spoil(Path())
-    assert_refused(cli, words, named)
+    cli.refused(words, *named)
 
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_refusals_name_file_and_cause_and_write_nothing(cli, words):
-    assert_refused(cli, words, REFUSED[words])
-
-
-def assert_refused(cli, words: str, named: list[str]) -> None:
-    """One line that names what is wrong, exit code 2, and no file written or changed."""
-    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
-    code, out, err = cli(words)
-    assert (code, out) == (2, "")
-    last = err.rstrip("\n").split("\n")[-1]
-    assert last.startswith("error: ")
-    for word in named:
-        assert word in last
-    assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
+    cli.refused(words, *REFUSED[words])
 
 
 def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
@@ -191,15 +177,14 @@ def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
 
 def test_demo_does_the_whole_job(cli, monkeypatch):
     monkeypatch.setattr("aaplug.verbs.demo.SCALES", (0.25, 0.125))
-    code, out, _ = cli("demo -o shown")
-    assert code == 0
+    out, _ = cli.done("demo -o shown")
     assert "auto" in out
     results = json.loads(Path("shown/results.json").read_text())
     assert results["auto@0.125"]["PSNR"] > results["classic@0.125"]["PSNR"] + 15
     assert read_scene(Path("shown/chair-converted.ply")).gaussians().fused
     width, height = image_size(Path("shown/contact-sheet.png"))
     assert min(width, height) > 300
-    assert cli("demo -o shown")[0] == 2
+    cli.refused("demo -o shown")
 
 
 def inria_model(folder: Path, config: str) -> Path:

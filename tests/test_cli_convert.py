@@ -20,8 +20,7 @@ def fused(name: str = "c.ply") -> list[str]:
 
 
 def test_convert_writes_what_was_fused(cli):
-    code, out, err = cli(f"{CONVERT} --json")
-    assert code == 0
+    out, err = cli.done(f"{CONVERT} --json")
     expected = {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
     assert json.loads(out) == {"output": "c.ply", "gaussians": 150, "fused": [expected]}
     assert "show it with 0.1 px², compensated (mip)" in err
@@ -31,7 +30,7 @@ def test_convert_writes_what_was_fused(cli):
 
 
 def test_convert_fuses_plain_mip_splatting_and_another_variance(cli):
-    assert cli(f"{CONVERT} --form mip-splatting --variance 0.1")[0] == 0
+    cli.done(f"{CONVERT} --form mip-splatting --variance 0.1")
     expected = Fusion("smoothing3d", {"variance": "0.1", "opacity": "volume"})
     assert read_scene(Path("c.ply")).gaussians().fused == (expected,)
 
@@ -52,8 +51,7 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
 @pytest.mark.parametrize("viewer", ["classic", "gsplat"])
 def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer):
     """A viewer that draws as training did is right at the training size, and every step takes away from that."""
-    code, out, err = cli(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
-    assert code == 0, err
+    out, err = cli.done(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
     assert [line for line in out.splitlines() if "converted" in line]
     found, compensated = read_scene(Path("c.ply")).gaussians(), viewer == "gsplat"
     assert (found.convention.kernel, found.convention.compensated) == (0.3, compensated)
@@ -80,8 +78,7 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer)
     ],
 )
 def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention, advice):
-    code, _, err = cli(f"{CONVERT} --for {viewer} --steps 0 --threads 1")
-    assert code == 0, err
+    _, err = cli.done(f"{CONVERT} --for {viewer} --steps 0 --threads 1")
     assert advice in " ".join(err.split())
     assert read_scene(Path("c.ply")).gaussians().convention == convention
 
@@ -107,8 +104,7 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
         return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
 
     monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
-    code, _, err = cli(f"{CONVERT} --for mip --steps 1")
-    assert (code, "starting from the original" in err) == (0, True)
+    assert "starting from the original" in cli.done(f"{CONVERT} --for mip --steps 1")[1]
     original, found = (read_scene(Path(name)).gaussians().logit_opacities for name in ("scene.ply", "c.ply"))
     assert (found - original).abs().max() < 1
 
@@ -116,19 +112,16 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
 def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
     tuned = replace(read_scene(Path("scene.ply")).gaussians(), fused=(Fusion("finetune"),))
     write_scene(Path("tuned.ply"), tuned)
-    assert cli("convert tuned.ply --cameras . -o c.ply")[0] == 0
+    cli.done("convert tuned.ply --cameras . -o c.ply")
     assert fused() == ["finetune", "matched-energy"]
-    code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip --steps 0")
-    assert (code, "already has matched-energy" in err) == (2, True)
+    cli.refused("convert c.ply --cameras . -o d.ply --for mip --steps 0", "already has matched-energy")
 
 
 def test_a_file_fits_the_viewer_or_names_one_that_opens_it(cli):
     means = read_scene("scene.ply").gaussians().means
     for viewer, axes in (("spark", "opencv"), ("spark --spz-axes opengl", "opengl"), ("mip", "opengl")):
-        code, _, err = cli(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")
-        assert code == 0, err
+        cli.done(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")
         assert torch.allclose(read_scene("c.spz", spz_axes=axes).gaussians().means, means, atol=1e-5)
-    code, _, err = cli("convert scene.ply --cameras . -o c.splat")
-    assert code == 0
+    _, err = cli.done("convert scene.ply --cameras . -o c.splat")
     assert "open the .splat in Spark 2.2.0 (blurAmount: 0.1) or GaussianSplats3D 0.4.7 (antialiased: true" in err
     assert " ".join(err.split()).count("a .splat cannot hold") == 1

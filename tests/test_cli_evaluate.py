@@ -11,7 +11,6 @@ from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene
 from aaplug.methods import RECIPES
 from aaplug.verbs.evaluate import evaluate
-from tests.test_cli import assert_refused
 
 
 def test_it_writes_results_and_prints_a_table(cli):
@@ -32,7 +31,7 @@ def test_it_writes_results_and_prints_a_table(cli):
 def test_the_library_gives_what_the_command_line_gives(cli):
     own = evaluate("scene.ply", ".", recipe=["mip"], scale=[0.5], rasterizer="eager")
     words = "evaluate scene.ply --cameras . --recipe mip --scale 0.5 --rasterizer eager -o out"
-    assert cli(words)[0] == 0
+    cli.done(words)
     found = json.loads(Path("out/results.json").read_text())
     assert found["mip@0.5"] == dict(own.select("mip", 0.5)[0].values)
     assert {key: found["_aaplug"][key] for key in own.protocol} == own.protocol
@@ -40,8 +39,7 @@ def test_the_library_gives_what_the_command_line_gives(cli):
 
 @pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"])
 def test_commas_part_values_as_spaces_do(cli, several):
-    code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
-    assert code == 0
+    out, _ = cli.done(f"evaluate scene.ply --cameras . {several} -o a,b --json")
     methods = {name for name in json.loads(out) if "@" in name and " " not in name}
     assert methods == {"mip@1", "mip@0.5", "auto@1", "auto@0.5"}
     assert Path("a,b/results.json").is_file()
@@ -49,15 +47,13 @@ def test_commas_part_values_as_spaces_do(cli, several):
 
 def test_without_photographs_it_takes_the_scenes_own_look(cli):
     words = "evaluate scene.ply --cameras . --views train --scale 0.5 --recipe mip --json"
-    code, out, err = cli(words)
-    assert code == 0
+    out, err = cli.done(words)
     assert "truth: self" in err
     assert json.loads(out)["_aaplug"]["truth"] == "self"
 
 
 def test_all_leaves_out_what_does_not_suit_the_scene(cli):
-    code, out, err = cli("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
-    assert code == 0
+    out, err = cli.done("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
     assert "recipe multi-scale left out: the scene lacks" in err
     assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale", "learned"}
 
@@ -78,8 +74,7 @@ def test_it_writes_a_report_and_inrias_folders(cli):
     pytest.importorskip("flip_evaluator")
     words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 0.5"
     options = "--metric psnr,flip,flicker --report --layout inria --show r_0"
-    code, out, err = cli(f"{words} {options}")
-    assert code == 0, err
+    out, _ = cli.done(f"{words} {options}")
     page = Path("out/report.html").read_text()
     assert "FLIP" in out
     assert "flicker" in page
@@ -97,4 +92,4 @@ def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):
 def test_an_unreadable_photograph_is_named(cli):
     photograph = Path("test/r_0.png")
     photograph.write_bytes(photograph.read_bytes()[: photograph.stat().st_size // 2])
-    assert_refused(cli, "evaluate scene.ply --cameras . -o new", ["r_0.png"])
+    cli.refused("evaluate scene.ply --cameras . -o new", "r_0.png")

@@ -32,7 +32,7 @@ def whole(dataset, tmp_path_factory) -> Path:
 
 def test_finetune_without_steps_changes_no_byte(cli):
     words = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --method mipmap-gs --steps 0"
-    assert cli(words)[0] == 0
+    cli.done(words)
     assert Path("tuned.ply").read_bytes() == Path("scene.ply").read_bytes()
     for name, same in (("same.ply", True), ("less.splat", False)):  # which has no harmonics
         found = json.loads(cli(f"{words} --json -o {name}".replace("-o tuned.ply ", ""))[1])
@@ -100,14 +100,11 @@ def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, monkeypatch, who
         patch.setattr(loop, "advance", killed)
         assert exit_code(lambda: main(RUN.split())) == -signal.SIGKILL
     assert not Path("tuned.ply").exists()
-    code, _, err = cli(f"{RUN} --resume")
-    assert (code, "resumed at step 2" in err) == (0, True)
+    assert "resumed at step 2" in cli.done(f"{RUN} --resume")[1]
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_anew(cli, whole):
-    code, _, err = cli(f"{RUN} --resume")
-    assert (code, "there is no checkpoint yet: starting at step 0" in err) == (0, True)
+    assert "there is no checkpoint yet: starting at step 0" in cli.done(f"{RUN} --resume")[1]
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
-    code, _, err = cli(f"{RUN} --resume")
-    assert (code, "tuned.ply: is of a run that is complete" in err) == (2, True)
+    cli.refused(f"{RUN} --resume", "tuned.ply: is of a run that is complete")

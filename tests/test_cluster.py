@@ -89,7 +89,7 @@ def local() -> Iterator[Any]:
 
 
 def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
-    assert cli(f"evaluate scene.ply {SETTINGS} -o one")[0] == 0
+    cli.done(f"evaluate scene.ply {SETTINGS} -o one")
     whole = timeless(Path("one"))
     with ExitStack() as stack:
         master = stack.enter_context(started("scheduler", "--port", "0", "--host", "127.0.0.1"))
@@ -117,14 +117,14 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         assert client.returncode == -signal.SIGKILL, client.stderr
         assert len(Path("out/progress.jsonl").read_text().splitlines()) == 3
         remove_left.cache_clear()
-        assert cli(f"{words} --resume")[0] == 0
+        cli.done(f"{words} --resume")
         assert timeless(Path("out")) == whole
         assert not list(Path("out").glob(f"{SCRATCH_PREFIX}*"))
 
         lost = "the connection is lost; start it again, and repeat the command, with --resume where it has one"
         assert run(master) == (2, f"error: scheduler {address}: {lost}")
         assert len(Path("out/progress.jsonl").read_text().splitlines()) == 2
-        assert cli(f"evaluate scene.ply {SETTINGS} -o out --resume")[0] == 0
+        cli.done(f"evaluate scene.ply {SETTINGS} -o out --resume")
         assert timeless(Path("out")) == whole
 
 
@@ -133,8 +133,8 @@ def test_scenes_are_converted_to_the_same_bytes(cli):
         "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
         "cameras = '.'\nvariance = 0.1\n"
     )
-    assert cli("convert --batch many.toml -o here")[0] == 0
-    assert cli("convert --batch many.toml -o there --scheduler local --threads 1")[0] == 0
+    cli.done("convert --batch many.toml -o here")
+    cli.done("convert --batch many.toml -o there --scheduler local --threads 1")
     for name in ("scene.ply", "b.ply"):
         assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
 
@@ -212,13 +212,11 @@ REFUSED = {
 @pytest.mark.parametrize("address", REFUSED)
 def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
-    code, out, err = cli(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
-    assert (code, out, err.splitlines()[-1]) == (2, "", f"error: {REFUSED[address]}")
-    assert not Path("out").exists()
+    line = cli.refused(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
+    assert line == f"error: {REFUSED[address]}"
 
 
 def test_without_the_extra_its_name_is_told(cli, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.job.find_spec", lambda name: None)
-    code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
-    assert code == 2
-    assert err.endswith(f"error: --scheduler: needs the extra `cluster`: {install_command('cluster')}\n")
+    said = f"error: --scheduler: needs the extra `cluster`: {install_command('cluster')}"
+    assert cli.refused("render scene.ply --cameras . -o out --rasterizer eager --scheduler local") == said

@@ -133,7 +133,7 @@ def test_a_viewer_draws_all_and_the_truth_stays(cli):
 
 
 def test_another_reference_and_levels_of_detail(cli):
-    assert cli("lod scene.ply --cameras . -o levels --levels 1 --no-refine --rasterizer eager")[0] == 0
+    cli.done("lod scene.ply --cameras . -o levels --levels 1 --no-refine --rasterizer eager")
     code, out, _ = cli(f"compare levels scene.ply --reference scene.ply {WORDS} --metric psnr --json")
     found = json.loads(out)
     assert (code, found["reference"]) == (0, "scene.ply")
@@ -196,11 +196,9 @@ def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
 
 def test_other_frames_are_refused_by_name(cli):
     write_scene("turned.ply", half_turn_about_x(read_scene("scene.ply").gaussians()))
-    code, out, err = cli(f"compare scene.ply turned.ply {WORDS}")
     named = "turned.ply: is scene.ply turned by 180 degrees about x"
-    assert (code, out) == (2, "")
-    assert f"{named}; bring both into one frame, or pass --any-frame" in err.splitlines()[-1]
-    code, out, err = cli(f"compare scene.ply turned.ply {WORDS} --any-frame --metric psnr --json")
+    cli.refused(f"compare scene.ply turned.ply {WORDS}", f"{named}; bring both into one frame, or pass --any-frame")
+    out, err = cli.done(f"compare scene.ply turned.ply {WORDS} --any-frame --metric psnr --json")
     assert json.loads(out)["scenes"]["turned.ply"]["frame"] == "turned by 180 degrees about x"
     assert f"warning: {named}" in err
 
@@ -210,8 +208,7 @@ def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):
     scene = read_scene("scene.ply").gaussians()
     write_scene("c.spz", scene, spz_axes=axes, spz_version=3)
     for words in ("scene.ply c.spz", "c.spz scene.ply"):
-        code, _, err = cli(f"compare {words} {WORDS} --metric psnr")
-        assert (code, "as fits scene.ply" in err) == (0, True)
+        assert "as fits scene.ply" in cli.done(f"compare {words} {WORDS} --metric psnr")[1]
 
 
 def test_harmonics_that_are_gone_are_said(cli):
@@ -237,10 +234,7 @@ REFUSED = {
 def test_bad_input_is_one_line(cli, words):
     write_scene("other.ply", read_scene("scene.ply").gaussians())
     Path("broken.ply").write_bytes(Path("scene.ply").read_bytes()[:-100])
-    code, out, err = cli(f"{words} --cameras . --rasterizer eager --scale 0.5")
-    assert (code, out) == (2, "")
-    assert err.splitlines()[-1].startswith("error: ")
-    assert REFUSED[words] in err.splitlines()[-1]
+    cli.refused(f"{words} --cameras . --rasterizer eager --scale 0.5", REFUSED[words])
 
 
 @pytest.fixture
@@ -267,7 +261,7 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
         patch.setattr(Journal, "add", stopping)
         assert cli(words)[0] == 130
     assert "resume" in cli(words)[2]
-    assert cli(f"{words} --resume")[0] == 0
+    cli.done(f"{words} --resume")
     data = json.loads(Path("out/compare.json").read_text())
     per_view = [scale["per_view"] for scale in data["scenes"]["dim.ply"]["scales"].values()]
     _, worst = min((views[name]["PSNR"], name) for views in per_view for name in views)

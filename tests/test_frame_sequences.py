@@ -28,19 +28,18 @@ def test_a_name_with_places_or_a_folder_with_a_format_is_a_sequence(cli):
     assert (code, json.loads(out)["frames"]) == (0, 6)
     names = [f"shot_{i:03d}.{FORMAT}" for i in range(1, 7)]
     assert sorted(bytes_of("a")) == sorted([*names, "shot.json"])
-    assert cli(f"{WORDS} b --format jpg --threads 2")[0] == 0
+    cli.done(f"{WORDS} b --format jpg --threads 2")
     assert sorted(bytes_of("b")) == [*(f"frame.{i:04d}.jpg" for i in range(1, 7)), "frame.json"]
 
 
 def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):
     words = f"{WORDS} out/f.####.png --transparent"
-    assert cli(words)[0] == 0
+    cli.done(words)
     whole, times = bytes_of("out"), {p.name: p.stat().st_mtime_ns for p in Path("out").iterdir()}
     for number in (2, 5):
         Path(f"out/f.{number:04d}.png").unlink()
-    code, _, err = cli(words)
-    assert (code, "already holds f.0001.png" in err) == (2, True), err
-    assert cli(f"{words} --resume")[0] == 0
+    cli.refused(words, "already holds f.0001.png")
+    cli.done(f"{words} --resume")
     assert bytes_of("out") == whole
     again = {path.name for path in Path("out").iterdir() if path.stat().st_mtime_ns != times[path.name]}
     assert again == {"f.0002.png", "f.0005.png"}
@@ -50,32 +49,32 @@ def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):
 
 def test_frames_of_another_request_are_not_continued(cli):
     words = f"{WORDS} out/f.####.png"
-    assert cli(words)[0] == 0
+    cli.done(words)
     before = bytes_of("out")
     changes = {
         "--transparent": "files", "--scale 0.25": "size, views", "--recipe classic": "recipe",
         "--fps 31": "fps",
     }  # fmt: skip
     for change, said in changes.items():
-        code, _, err = cli(
-            f"{words} --resume {change}".replace("--scale 0.5 ", "" if "scale" in change else "--scale 0.5 ")
+        cli.refused(
+            f"{words} --resume {change}".replace("--scale 0.5 ", "" if "scale" in change else "--scale 0.5 "),
+            f"is of another request ({said} changed since)",
         )
-        assert (code, f"is of another request ({said} changed since)" in err) == (2, True), err
     Path("out/f.json").rename("f.json")
-    code, _, err = cli(f"{words} --resume")
-    assert (code, "f.json: does not exist, which says what the frames show" in err) == (2, True), err
+    cli.refused(f"{words} --resume", "f.json: does not exist, which says what the frames show")
     Path("out/f.json").write_text("[1]")
-    code, _, err = cli(f"{words} --resume")
-    assert (code, "f.json: is damaged; start again with --overwrite" in err) == (2, True), err
+    cli.refused(f"{words} --resume", "f.json: is damaged; start again with --overwrite")
     Path("f.json").replace("out/f.json")
     assert bytes_of("out") == before
 
 
 def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
     words = f"{WORDS} out/f.####.png"
-    assert cli(words)[0] == 0
-    code, _, err = cli(f"{words} --overwrite --seconds 0.1".replace("--seconds 0.2 ", ""))
-    assert (code, "holds f.0004.png, f.0005.png, f.0006.png, which would follow the 3 frames" in err) == (2, True), err
+    cli.done(words)
+    cli.refused(
+        f"{words} --overwrite --seconds 0.1".replace("--seconds 0.2 ", ""),
+        "holds f.0004.png, f.0005.png, f.0006.png, which would follow the 3 frames",
+    )
     with monkeypatch.context() as patch:  # stopped before its first frame
         patch.setattr("aaplug.verbs.video.write_frames", lambda *args, **how: sys.exit(3))
         assert cli(f"{words} --overwrite --recipe classic")[0] == 3
@@ -98,18 +97,17 @@ REFUSED = {
 @pytest.mark.parametrize("words", REFUSED)
 def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatch, words):
     monkeypatch.setattr(Renderer, "draw", None)
-    before = sorted(Path().iterdir())
-    code, _, err = cli(f"{WORDS} {words}")
-    assert (code, REFUSED[words] in err) == (2, True), err
-    assert sorted(Path().iterdir()) == before
+    cli.refused(f"{WORDS} {words}", REFUSED[words])
 
 
 def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
     path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
     monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _: path)
     Path("path.json").touch()
-    code, _, err = cli(f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json")
-    assert (code, "--path: has frames of different sizes (20x15, 15x20 px)" in err) == (2, True), err
+    cli.refused(
+        f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json",
+        "--path: has frames of different sizes (20x15, 15x20 px)",
+    )
     assert not Path("out").exists()
 
 
@@ -127,9 +125,9 @@ def test_a_kill_loses_no_finished_frame_and_the_rest_ends_the_same(cli, monkeypa
         assert exit_code(lambda: main(words.split())) == -signal.SIGKILL
     found = {path: path.stat().st_mtime_ns for path in Path("out").glob(f"f.*.{FORMAT}")}
     assert 0 < len(found) < 6
-    assert cli(words)[0] == 0
+    cli.done(words)
     assert all(path.stat().st_mtime_ns == then for path, then in found.items())
     resumed = bytes_of("out")
-    assert cli(words.replace("out/", "whole/"))[0] == 0
+    cli.done(words.replace("out/", "whole/"))
     assert resumed == bytes_of("whole")
     assert len(resumed) == 7

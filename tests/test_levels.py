@@ -254,18 +254,17 @@ def test_a_projection_along_an_axis_has_the_packed_minors():
 
 
 def test_one_lighter_scene(cli):
-    code, out, err = cli("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 3 --json")
-    assert code == 0, err
+    out, _ = cli.done("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 3 --json")
     assert json.loads(out)["levels"] == [{"rate": pytest.approx(0.2**0.5), "gaussians": 30}]
     found = read_scene(Path("light.ply")).gaussians()
     assert (len(found), found.convention) == (30, CLASSIC)
     assert found.fused[0].settings == {"rate": "0.4472", "from": "150"}
-    assert cli("lod scene.ply --cameras . -o counted.ply --simplify 12 --no-refine")[0] == 0
+    cli.done("lod scene.ply --cameras . -o counted.ply --simplify 12 --no-refine")
     assert read_scene(Path("counted.ply")).count == 12
 
 
 def test_a_budget_is_kept(cli):
-    assert cli("lod scene.ply --cameras . -o light.ply --budget 0.01 --steps 1")[0] == 0
+    cli.done("lod scene.ply --cameras . -o light.ply --budget 0.01 --steps 1")
     assert 8_000 < Path("light.ply").stat().st_size <= 10_000
 
 

@@ -126,13 +126,11 @@ def test_the_command_merges_files_of_several_formats(cli):
     scene = read_scene("scene.ply").gaussians()
     aaplug.write_scene("b.glb", replace(scene, convention=MIP, origin=None))
     words = "merge scene.ply b.glb --cameras . -o c.sog --move 0,0,0 4,0,0 --turn 0,0,0 0,90,0 --json"
-    code, out, err = cli(words)
-    assert code == 0, err
+    out, err = cli.done(words)
     assert json.loads(out) == {"output": "c.sog", "gaussians": 2 * len(scene), "convention": "mip"}
     assert "converted from classic to mip, by" in err
     merged = read_scene("c.sog")
     assert (merged.count, merged.convention) == (2 * len(scene), MIP)
     assert [fusion.method for fusion in merged.fused] == ["matched-energy"]
-    code, _, err = cli("merge scene.ply b.glb -o scene.ply --overwrite")
-    assert (code, "is also the input" in err) == (2, True)
+    cli.refused("merge scene.ply b.glb -o scene.ply --overwrite", "is also the input")
     assert not list(Path().glob("*.tmp"))

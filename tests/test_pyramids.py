@@ -276,13 +276,11 @@ def test_a_folder_of_levels_is_a_scene(cli, folder):
     fused = [fusion.settings for fusion in read_scene(folder / "scene_lod2.ply").gaussians().fused]
     assert [settings["rate"] for settings in fused if "rate" in settings] == ["0.5", "0.25"]
     for words in ("--scale 0.25", "--scale 0.25 --quality fast", "--scale 0.25 --quality best"):
-        code, _, err = cli(f"render levels --cameras . -o out {words} --overwrite")
-        assert code == 0, err
-    code, _, err = cli("evaluate levels --cameras . -o results --scale 0.5 --recipe auto matched --truth self")
-    assert code == 0, err
+        cli.done(f"render levels --cameras . -o out {words} --overwrite")
+    cli.done("evaluate levels --cameras . -o results --scale 0.5 --recipe auto matched --truth self")
     assert "3 levels of detail" in cli("info levels")[1]
-    assert cli("convert levels --cameras . -o converted.ply")[0] == 0
-    assert cli("lod levels --cameras . -o light.ply --simplify 0.5 --no-refine")[0] == 0
+    cli.done("convert levels --cameras . -o converted.ply")
+    cli.done("lod levels --cameras . -o light.ply --simplify 0.5 --no-refine")
 
 
 class Interrupting(Monitor):
@@ -299,22 +297,16 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     with pytest.raises(KeyboardInterrupt):
         lod("scene.ply", ".", folder, levels=2, steps=3, monitor=Interrupting())
     assert {file.name: file.read_bytes() for file in folder.glob("*.ply")}.items() < first.items()
-    unfinished = cli("info levels")
-    assert unfinished[0] == 2
-    assert "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`" in unfinished[2]
-    code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
-    assert code == 0, err
+    cli.refused("info levels", "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`")
+    _, err = cli.done("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
     assert "resumed with 1 level" in err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == first
-    refusal = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
-    assert refusal[0] == 2
-    assert "other options" in refusal[2]
+    cli.refused("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume", "other options")
 
 
 def test_fewer_levels_leave_nothing_of_more(cli, folder):
     for words in ("--levels 1 --no-refine", "--levels 1 --steps 1 --for spark"):
-        code, _, err = cli(f"lod scene.ply --cameras . -o levels --overwrite {words}")
-        assert code == 0, err
+        cli.done(f"lod scene.ply --cameras . -o levels --overwrite {words}")
         assert [file.name for file in sorted(folder.glob("*.ply"))] == ["scene_lod0.ply", "scene_lod1.ply"]
         if "--for" not in words:
             (folder / "notes.txt").write_text("not a level")
@@ -324,13 +316,11 @@ def test_fewer_levels_leave_nothing_of_more(cli, folder):
 
 
 def test_an_earlier_runs_levels_go_whatever_they_are_called_and_no_input_does(cli, folder):
-    refused = cli("lod levels/scene_lod2.ply --cameras . -o levels --levels 1 --no-refine --overwrite")
-    assert refused[0] == 2
-    assert "scene_lod2.ply: is also the input" in refused[2]
+    words = "--cameras . -o levels --levels 1 --no-refine --overwrite"
+    cli.refused(f"lod levels/scene_lod2.ply {words}", "scene_lod2.ply: is also the input")
     Path("scene.ply").rename("other.ply")
     Path("levels/other_lod2.ply").write_bytes(b"of a viewer, so in no manifest")
-    code, _, err = cli("lod other.ply --cameras . -o levels --levels 1 --no-refine --overwrite")
-    assert code == 0, err
+    cli.done(f"lod other.ply {words}")
     assert sorted(file.name for file in folder.iterdir()) == [MANIFEST, "other_lod0.ply", "other_lod1.ply"]
 
 
@@ -372,9 +362,7 @@ BROKEN = {
 def test_a_broken_pyramid_is_refused_in_one_line(cli, folder, case):
     breaking, said = BROKEN[case]
     breaking(folder / "scene_lod1.ply", folder / MANIFEST)
-    code, out, err = cli("render levels --cameras . -o images")
-    assert (code, out) == (2, "")
-    assert said in err.splitlines()[-1]
+    cli.refused("render levels --cameras . -o images", said)
     with pytest.raises(FormatError):
         read_pyramid(folder)
 
@@ -417,12 +405,9 @@ def test_a_level_is_tuned_over_the_rates_that_draw_it_and_on_free_poses_too(samp
 
 def test_levels_for_a_viewer_are_files_by_its_rule_and_no_pyramid(cli):
     words = "lod scene.ply --cameras . -o levels --levels 1 --steps 2"
-    code, _, err = cli(f"{words} --for spark")
-    assert code == 0, err
+    cli.done(f"{words} --for spark")
     assert all(b"fused=finetune steps=2 for=spark" in file.read_bytes() for file in Path("levels").iterdir())
     assert sorted(file.name for file in Path("levels").iterdir()) == ["scene_lod0.ply", "scene_lod1.ply"]
     assert [read_scene(file).gaussians().convention for file in Path("levels").iterdir()] == [ANTIALIASED] * 2
     for more, said in (("--resume", "levels for aaplug"), ("--no-refine", "is what the result is tuned for")):
-        code, _, err = cli(f"{words} --for spark {more}")
-        assert code == 2
-        assert said in err
+        cli.refused(f"{words} --for spark {more}", said)

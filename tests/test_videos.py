@@ -137,8 +137,7 @@ def test_what_becomes_small_is_also_shown_enlarged():
 
 
 def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):
-    code, _, err = cli("video scene.ply --cameras . -o v.webm --resolution 320x240 --seconds 0.2 --fps 20")
-    assert code == 0, err
+    cli.done("video scene.ply --cameras . -o v.webm --resolution 320x240 --seconds 0.2 --fps 20")
     found, _ = read(Path("v.webm"))
     far = found[2, :, -320:].astype(int)  # the turning point: 1/8, with an inset of 100 px
     assert np.abs(far[-100:, -100:] - far[:1, :1]).max() > 60
@@ -153,32 +152,29 @@ def test_the_program_makes_a_video_side_by_side(cli, path):
     assert "OpenCV" not in err
     found, fps = read(Path("v.webm"))
     assert (found.shape, fps) == ((4, 48, 132, 3), 20)  # two panes of 64, and a gap of 4
-    assert cli(words)[0] == 2
+    cli.refused(words)
     changes = np.abs(np.diff(found[..., -64:, :].astype(int), axis=0)).mean(axis=(1, 2, 3))
     assert changes.min() > 0.1  # the camera moves
 
 
 def test_the_program_follows_a_camera_path(cli):
     Path("path.json").write_text(json.dumps(document()))
-    code, _, err = cli("video scene.ply --cameras . -o v.webm --path path.json --beside none")
-    assert code == 0, err
+    cli.done("video scene.ply --cameras . -o v.webm --path path.json --beside none")
     found, fps = read(Path("v.webm"))
     assert (found.shape, fps) == ((1, 40, 60, 3), 24)
-    assert cli("video scene.ply --cameras . -o w.webm --path gone.json")[0] == 2
+    cli.refused("video scene.ply --cameras . -o w.webm --path gone.json")
 
 
 VR = "--cameras . --lens vr180 --eye-distance 0.4 --resolution 24x24 --rasterizer eager"
 
 
 def test_both_eyes_are_side_by_side_in_a_video(cli):
-    code, _, err = cli(f"video scene.ply {VR} -o v.webm --seconds 0.1")
-    assert code == 0, err
+    cli.done(f"video scene.ply {VR} -o v.webm --seconds 0.1")
     frames, _ = read(Path("v.webm"))
     assert frames.shape[2] == 2 * frames.shape[1] == 48
     left, right = np.split(frames.astype(float), 2, axis=2)
     assert np.abs(left - right).max() > 20
-    code, _, err = cli(f"video scene.ply {VR} -o frames/frame.####.png --seconds 0.1")
-    assert (code, "`render --path` writes both" in err) == (2, True)
+    cli.refused(f"video scene.ply {VR} -o frames/frame.####.png --seconds 0.1", "`render --path` writes both")
 
 
 def test_the_shutter_of_an_eye_follows_that_eye(cli, monkeypatch):
@@ -188,8 +184,7 @@ def test_the_shutter_of_an_eye_follows_that_eye(cli, monkeypatch):
     for place, frame in enumerate(frames):
         frame["camera_to_world"][7] = 0.01 * place
     Path("path.json").write_text(json.dumps(document(camera_path=frames)))
-    code, _, err = cli(f"render scene.ply {VR} -o out --path path.json --shutter 0.5 --samples 2")
-    assert code == 0, err
+    cli.done(f"render scene.ply {VR} -o out --path path.json --shutter 0.5 --samples 2")
     assert [view.name.rpartition("-")[2] for view in shown] == ["left", "right"] * (len(shown) // 2)
     for view, other in zip(shown[::2], shown[1::2], strict=True):
         opens, closes = view.exposure.motion

@@ -218,9 +218,8 @@ def test_garbage_harms_nobody(address, capfd):
 
 def test_a_busy_port_is_one_clear_line(address, cli):
     port = address.split(":")[2].rstrip("/")
-    code, _, err = cli(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}")
-    assert code == 2
-    assert f"--port: {port} of 127.0.0.1 cannot be used: address already in use" in err.splitlines()[-1]
+    said = f"--port: {port} of 127.0.0.1 cannot be used: address already in use"
+    cli.refused(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}", said)
 
 
 def test_a_host_that_cannot_be_a_name_is_refused(seen):  # noqa: F811
@@ -239,8 +238,7 @@ def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=interrupted)))
-    code, _, err = cli("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
-    assert code == 0
+    _, err = cli.done("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
     assert "open http://127.0.0.1:" in err
     assert err.splitlines()[-1] == "closed"
 
