@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import multiprocessing
+import os
 import shutil
 import subprocess
 import sys
@@ -215,6 +216,15 @@ def click(box: Any) -> None:
     box.dispatch_event("click")
 
 
+def run_python(program: str, *words: object, **variables: object) -> subprocess.CompletedProcess[str]:
+    """Run a program in a process of its own, with these words and variables of the environment."""
+    command = [sys.executable, "-c", program, *map(str, words)]
+    environment = os.environ | {name: str(value) for name, value in variables.items()}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    print(done.stderr)  # which is shown where the test fails
+    return done
+
+
 def exit_code(work: Callable[[], object]) -> int | None:
     """That of a copy of this process which does the work; negative where a signal ended it."""
     child = multiprocessing.get_context("fork").Process(target=work)
@@ -248,9 +258,7 @@ def memory_taken(prepare: str, *works: str) -> list[int]:
 
     A process that ran others has memory to reuse.  A copy, of which all but the last are, also counts the code it runs.
     """
-    command = [sys.executable, "-c", MEASURE.format(prepare=prepare, works=works)]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
-    return [*map(int, run.stdout.split())]
+    return [*map(int, run_python(MEASURE.format(prepare=prepare, works=works)).stdout.split())]
 
 
 def straight_camera(

@@ -3,11 +3,9 @@
 import errno
 import heapq
 import json
-import os
 import pickle
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -34,7 +32,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import torch_threads
 from aaplug.system.locks import SCRATCH_PREFIX
-from tests.conftest import COMPILED, ROOT, make_camera, make_scene, sized
+from tests.conftest import COMPILED, make_camera, make_scene, run_python, sized
 
 ANSWER = 1e-5
 CACHE = compiled.cache_folder()
@@ -208,14 +206,7 @@ DRAWS = """if True:
 
 def test_drawing_writes_nothing_and_a_killed_process_leaves_nothing(built, tmp_path):
     """The folder of temporary files may be full, missing, or not allow programs to run."""
-    done = subprocess.run(
-        [sys.executable, "-c", DRAWS],
-        cwd=ROOT,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(DRAWS, TMPDIR=tmp_path)
     assert (done.stdout, done.returncode) == ("compiled\n", -9), done.stderr
     assert not [*tmp_path.iterdir()]
 
@@ -407,10 +398,7 @@ def test_names_of_packages_and_digests_of_recipes_are_the_same_in_every_process(
         "packages = {kernel.name: package_path(kernel).name for kernel in kernels};"
         "print(json.dumps([packages, {name: recipe.digest for name, recipe in RECIPES.items()}]))"
     )
-    other = os.environ | {"PYTHONHASHSEED": "7"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, env=other, capture_output=True, text=True, check=True
-    )
+    done = run_python(program, PYTHONHASHSEED=7)
     digests = {name: recipe.digest for name, recipe in RECIPES.items()}
     assert json.loads(done.stdout) == [paths(ALL_KERNELS), digests]
 

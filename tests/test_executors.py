@@ -21,7 +21,7 @@ from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, given_threads, torch_threads
 from aaplug.system.monitor import Monitor
-from tests.conftest import ROOT, SAMPLE
+from tests.conftest import ROOT, SAMPLE, run_python
 
 PARENT = """
 import time
@@ -121,10 +121,7 @@ def test_kept_memory_is_not_fetched_again():
                 del several
         print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
     """
-    kept, usual = (
-        int(subprocess.run([sys.executable, "-c", script, how], capture_output=True, text=True, check=True).stdout)
-        for how in ("kept", "usual")
-    )
+    kept, usual = (int(run_python(script, how).stdout) for how in ("kept", "usual"))
     assert kept < usual / 10
 
 
@@ -143,7 +140,7 @@ def test_work_of_other_programs_is_counted_and_own_work_is_not() -> None:
     seconds = 0.3
     work = f"import time; end = time.process_time() + {seconds}\nwhile time.process_time() < end: pass"
     readings = [Reading.now()]
-    subprocess.run([sys.executable, "-c", work], check=True)
+    run_python(work)
     readings.append(Reading.now())
     exec(work)
     readings.append(Reading.now())
@@ -279,7 +276,7 @@ LIMITED = """if True:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_rendering_without_enough_memory_is_one_clear_error():
-    done = subprocess.run([sys.executable, "-c", LIMITED], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = run_python(LIMITED)
     assert done.stdout.startswith("view view at 6000x4000: out of memory;"), done
 
 

@@ -1,9 +1,6 @@
 """Fine-tuning: gradients of the whole loss, bounds, densification, and runs that nothing can spoil."""
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -36,7 +33,7 @@ from aaplug.system.cores import FREE_CORES
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import torch_threads
 from aaplug.verbs.finetune import finetune
-from tests.conftest import ROOT, make_camera, make_scene
+from tests.conftest import make_camera, make_scene, run_python
 
 F64 = torch.float64
 EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
@@ -410,10 +407,10 @@ def test_balanced_weights_are_against_the_roots_of_errors():
     assert found.anchor == pytest.approx(QUICK_SETTINGS.anchor * 100)
 
 
-def test_a_run_begins_without_a_file_among_the_temporary_ones(tmp_path):
+def test_a_run_begins_without_a_file_among_the_temporary_ones(tmp_path, monkeypatch):
     program = "from tests.test_finetuning import begin, make_job; begin(make_job()); import os; print(os.environ)"
-    environment = {k: v for k, v in os.environ.items() if k != DYNAMO_FOLDER} | {"TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    monkeypatch.delenv(DYNAMO_FOLDER, raising=False)
+    done = run_python(program, TMPDIR=tmp_path)
+    assert done.stdout, done.stderr
     assert DYNAMO_FOLDER not in done.stdout
     assert not [*tmp_path.iterdir()]

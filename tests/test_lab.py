@@ -1,16 +1,15 @@
 """The folder for comparisons: nothing needs it, and deleting it deletes its entries alone."""
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 
 from aaplug.io.images import image_size
-from tests.conftest import ROOT, SAMPLE
+from tests.conftest import ROOT, SAMPLE, run_python
 
 PROGRAM = """
-import sys
+import os, sys
+os.chdir(sys.argv[1])
+sys.path.remove("")  # the checkout
 # An editable installation would find the folder where it was installed from.
 sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in getattr(finder, "__module__", "")]
 import aaplug
@@ -33,14 +32,7 @@ def test_without_its_folder_auto_renders_and_nothing_is_said_of_it(tmp_path):
     hidden = shutil.ignore_patterns("lab", "__pycache__")
     shutil.copytree(ROOT / "aaplug", tmp_path / "aaplug", ignore=hidden)
     shutil.copytree(ROOT / "cli", tmp_path / "aaplug_cli", ignore=hidden)
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path), str(SAMPLE)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(PROGRAM, tmp_path, SAMPLE, PYTHONPATH=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "lab" not in done.stderr
     images = [*(tmp_path / "images").rglob("*.png")]

@@ -3,8 +3,6 @@
 import dataclasses
 import math
 import re
-import subprocess
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -15,6 +13,7 @@ from aaplug_cli.verbs import VERBS
 
 from aaplug.options.base import Number, Options
 from aaplug.system.errors import UsageError
+from tests.conftest import run_python
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
@@ -186,5 +185,5 @@ for options, name, value in (
 
 def test_a_value_of_another_type_is_refused_from_python_too():
     """In a process of its own, in which nothing else checks types."""
-    done = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True, check=False)
+    done = run_python(WRONG)
     assert (done.stdout, done.stderr) == ("", "")

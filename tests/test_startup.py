@@ -17,6 +17,7 @@ from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOption
 from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.registry import REGISTRIES, _at, names_of
+from tests.conftest import run_python
 from tests.test_options import REFUSED
 
 SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "matplotlib", "PIL", "av"]
@@ -54,10 +55,7 @@ MISTAKES = [
 
 def answered(words: list[str]) -> list[tuple[str, int, list[str]]]:
     """Each command's words and exit code, and the slow packages that were imported by its end."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps([words, SLOW])], capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(run_python(PROGRAM, json.dumps([words, SLOW])).stdout.splitlines()[-1])
 
 
 def test_help_imports_nothing_slow():
