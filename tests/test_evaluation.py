@@ -99,15 +99,15 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(look, vie
 
 def test_work_without_a_truth_empty_or_doubled_is_refused(look, views):
     bare = [replace(views[0], photo=None)]
-    for work, words in (
-        (task(look, views, scales=()), "needs at least"),
-        (task(look, views, scales=(0.0,)), "above 0"),
-        (task(look, views, scales=(1.0, 1.0)), "named twice"),
-        (task(look, bare), "a: has no photograph"),
-        (task(look, views, protocol="fov"), "moves the camera"),
+    for given, changes, words in (
+        (views, {"scales": ()}, "needs at least"),
+        (views, {"scales": (0.0,)}, "above 0"),
+        (views, {"scales": (1.0, 1.0)}, "named twice"),
+        (bare, {}, "a: has no photograph"),
+        (views, {"protocol": "fov"}, "moves the camera"),
     ):
         with pytest.raises(UsageError, match=words):
-            evaluate(work)
+            task(look, given, **changes)
 
 
 def test_reports_hold_every_view_recipe_and_scale(look, views):

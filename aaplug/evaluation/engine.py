@@ -89,6 +89,21 @@ class Task:
     metrics: Sequence[Metric] | None = None
     ceiling: bool = True
 
+    def __post_init__(self) -> None:
+        """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs."""
+        if not (self.candidates and self.scales and self.views):
+            raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
+        if any(not (scale > 0 and math.isfinite(scale)) for scale in self.scales):
+            raise UsageError("scale", f"sizes must be above 0, got {min(self.scales):g}")
+        names = {CEILING, *(candidate.name for candidate in self.candidates)}
+        if len(names) != len(self.candidates) + 1 or len(set(self.scales)) != len(self.scales):
+            raise UsageError("evaluate", "a recipe or a scale is named twice")
+        if self.truth.source == "photographs":
+            if not self.resizes:
+                problem = f"protocol {self.truth.protocol.name} moves the camera: no photograph shows that"
+                raise UsageError("truth", problem)
+            source_of(self.views, "photographs")
+
     @property
     def measured(self) -> tuple[Metric, ...]:
         """The metrics, first those that compare with the truth."""
@@ -155,9 +170,10 @@ def evaluate(
     apply: calls a function with every item, like `map`; an executor's does so in several processes.
 
     Raises:
-        UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
+        UsageError: the journal is of another request.
     """
-    task = _checked(task)
+    if len({view.name for view in task.views}) < len(task.views):  # as views of two splits may
+        task = replace(task, views=[replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(task.views)])
     request = _request(task) | dict(facts or {})
     with Journal(journal, request, resume, partial(_answers, task)) as finished:
         remaining = [index for index in range(len(task.views)) if index not in finished.views]
@@ -179,25 +195,6 @@ def _answers(task: Task, view: int, measurements: Sequence[Measurement]) -> bool
         and sorted((m.recipe, m.scale) for m in measurements) == cases
         and all(m.view == task.views[view].name and set(m.values) == metrics for m in measurements)
     )
-
-
-def _checked(task: Task) -> Task:
-    """The task, its views numbered where two have the same name, as views of two splits may."""
-    if not (task.candidates and task.scales and task.views):
-        raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
-    if any(not (scale > 0 and math.isfinite(scale)) for scale in task.scales):
-        raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
-    names = {CEILING, *(candidate.name for candidate in task.candidates)}
-    if len(names) != len(task.candidates) + 1 or len(set(task.scales)) != len(task.scales):
-        raise UsageError("evaluate", "a recipe or a scale is named twice")
-    views = task.views
-    if len({view.name for view in views}) < len(views):
-        views = [replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(views)]
-    if task.truth.source == "photographs":
-        if not task.resizes:
-            raise UsageError("truth", f"protocol {task.truth.protocol.name} moves the camera: no photograph shows that")
-        source_of(views, "photographs")
-    return replace(task, views=views)
 
 
 def _request(task: Task) -> dict[str, Any]:
