@@ -22,6 +22,7 @@ from aaplug.evaluation.results import (
     NO_PHOTOGRAPH,
     as_csv,
     mean,
+    method,
     metric_grid,
     per_view,
     results,
@@ -267,7 +268,7 @@ def test_images_lie_where_3dgs_scripts_look(look, views, tmp_path):
     assert "test/classic@0.5/renders/00000.png" in every
     assert "test/classic@0.5/gt/00001.png" in every
     assert not any("@2/" in path for path in every if path.startswith("test"))  # no truth there
-    assert "images/ceiling@0.5/renders/00001.png" in every
+    assert f"images/{method(CEILING, 0.5)}/renders/00001.png" in every
     assert not any(path.endswith("00000.png") for path in every if path.startswith("images"))
     stored = read_image(store.path(1, "matched", 0.5), None)
     image = drawn(look, views[1].scaled(0.5), "matched")

@@ -58,5 +58,4 @@ class ImageStore:
 
     def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS, folder: str = REPORT_FOLDER) -> Path:
         """Path of a render, or by `kind` of its truth; in the report's folder unless the other one is named."""
-        name = "ceiling" if recipe == CEILING else recipe
-        return self.folder / folder / method(name, scale) / kind / f"{view:05d}.png"
+        return self.folder / folder / method(recipe, scale) / kind / f"{view:05d}.png"
