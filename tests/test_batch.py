@@ -101,6 +101,17 @@ def test_scenes_of_the_command_line_share_their_cameras(batch):
     assert json.loads(out)["mean"]["matched@0.5"]["SSIM"] > 0.5
 
 
+def test_overwriting_a_batch_removes_scenes_that_it_has_no_more(batch):
+    for name in ("b.ply", "c.ply"):
+        shutil.copy("scene.ply", name)
+    words = "--cameras . -o out --rasterizer eager --recipe matched --scale 0.5"
+    assert batch(f"evaluate scene.ply b.ply c.ply {words}")[0] == 0
+    Path("out/c/note.txt").touch()
+    assert batch(f"evaluate scene.ply broken.ply {words} --overwrite")[0] == 1
+    left = {str(path.relative_to("out")) for path in Path("out").glob("*/*")}
+    assert left == {"c/note.txt", "scene/per_view.json", "scene/progress.jsonl", "scene/results.csv", "scene/results.json"}
+
+
 def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch):
     words = "evaluate --batch batch.toml --layout inria"
     Path("batch.toml").write_text(SETTINGS.replace('"train"', '"r_1,r_2"'))

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from aaplug.core.gaussians import digest_of_scene
+from aaplug.evaluation.journal import JOURNAL
+from aaplug.evaluation.report.files import COMPARED, PAGE, RESULTS
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene
 from aaplug.methods import RECIPES
@@ -81,6 +83,24 @@ def test_it_writes_a_report_and_inrias_folders(cli):
     assert Path("out/plots/psnr.png").is_file()
     assert image_size(Path("out/test/classic@0.5/gt/00000.png")) == (32, 24)
     assert Path("out/results.csv").read_text().count("\n") == 4
+
+
+def test_overwriting_leaves_nothing_of_an_earlier_run_and_all_that_others_wrote(cli):
+    own = ["note.txt", "plots/mine.png", "test/mip@0.5/renders/mine.png"]
+    options = "scene.ply --cameras . -o out --rasterizer eager --metric psnr --scale 0.5"
+    assert cli(f"evaluate {options} --recipe classic mip --report --layout inria")[0] == 0
+    for name in own:
+        Path("out", name).touch()
+    evaluation = f"evaluate {options} --recipe auto --overwrite"
+    for words, files in (
+        (evaluation, {JOURNAL, *RESULTS}),
+        (f"compare scene.ply {options} --overwrite", {JOURNAL, *COMPARED, PAGE}),
+        (evaluation, {JOURNAL, *RESULTS}),
+    ):
+        assert cli(words)[0] == 0
+        left = {str(path.relative_to("out")) for path in Path("out").rglob("*") if path.is_file()}
+        page = {name for name in left if PAGE in files and name.startswith(("images", "plots"))}
+        assert left == {*own, *files, *page}
 
 
 def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):

@@ -19,6 +19,8 @@ from aaplug.evaluation.results import Measurement
 from aaplug.system.errors import FormatError, OutputError, UsageError, listing, reason
 from aaplug.system.locks import lock
 
+JOURNAL = "progress.jsonl"
+
 Fits = Callable[[int, Sequence[Measurement]], bool]
 
 

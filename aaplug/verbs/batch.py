@@ -1,7 +1,9 @@
 """Batch: evaluate many scenes.  One that fails stops no other; the summary names it."""
 
+import json
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +15,9 @@ from rich.table import Table
 
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.data_sets import Paper, data_set_of, paper
+from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.protocols import Protocol
-from aaplug.evaluation.report.files import as_json, write_texts
+from aaplug.evaluation.report.files import as_json, remove_run, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, metric_grid, results
 from aaplug.io.atomic import AnyPath, refuse_existing, writing
 from aaplug.system.contracts import contract
@@ -150,6 +153,8 @@ def batch(
     check()
     reports, failures = dict[str, Report](), dict[str, str]()
     with writing(output, check, (), folder=True):
+        if overwrite:
+            _remove_batch(Path(output))
         for folder, (name, run) in zip(folders, runs, strict=True):
             monitor.say(f"--- {name}")
             options = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite, "monitor": monitor}
@@ -170,6 +175,17 @@ def batch(
         for path in write_texts(output, texts, overwrite=True):  # checked at the start
             monitor.say(f"wrote {path}")
     return done
+
+
+def _remove_batch(output: Path) -> None:
+    """Remove what an earlier batch wrote, as its summary tells."""
+    with suppress(OSError, ValueError, LookupError, TypeError):  # no summary, or a damaged one
+        scenes = json.loads((output / SUMMARY).read_bytes())["scenes"]
+        for journal in output.glob(f"*/{JOURNAL}"):
+            if journal.parent.name in scenes:
+                remove_run(journal.parent)
+        for name in (RESULTS, TABLE, SUMMARY):
+            (output / name).unlink(missing_ok=True)
 
 
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:

@@ -9,8 +9,9 @@ from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
 from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.metrics import find_metrics
-from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, sheet_of, write_page, write_texts
+from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, sheet_of, write_page, write_texts
 from aaplug.evaluation.results import as_csv
 from aaplug.evaluation.truth import Truth
 from aaplug.io.atomic import AnyPath
@@ -24,7 +25,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import ProcessesIfLong
-from aaplug.verbs.evaluate import JOURNAL, check_journalled
+from aaplug.verbs.evaluate import check_journalled
 from aaplug.verbs.verb import ScenesLike, compares
 from aaplug.verbs.views import file_names
 
@@ -87,6 +88,8 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
                 "shown": options.show,
             },
         }
+        if folder and options.overwrite:
+            remove_run(folder)
         pool = workers.cluster or ProcessesIfLong(workers.threads)
         with job.monitor.progress("comparing", "views") as tell:
             report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, pool.map)

@@ -10,8 +10,9 @@ from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.engine import Task, candidates_of, facts_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.metrics import find_metrics
-from aaplug.evaluation.report.files import PAGE, RESULTS, as_json, write_page, write_texts
+from aaplug.evaluation.report.files import PAGE, RESULTS, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.atomic import AnyPath, refuse_existing
@@ -23,8 +24,6 @@ from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, not_one_of
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
-
-JOURNAL = "progress.jsonl"
 
 
 @writes(EvaluateOptions)
@@ -70,6 +69,8 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         choices |= {"order": options.order, "shown": options.show if options.report else None, "layout": options.layout}
         facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": choices}
         apply = workers.cluster.map if workers.cluster else map
+        if folder and options.overwrite:
+            remove_run(folder)
         with job.monitor.progress(f"evaluating {name}", "views") as tell:
             report = measure(task, facts, tell, folder and folder / JOURNAL, options.resume, images, apply)
         if folder and images:

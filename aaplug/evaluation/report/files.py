@@ -6,6 +6,8 @@ Of both: report.html and its plots.
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,17 +18,43 @@ from torch import Tensor
 from aaplug.evaluation.comparison import Comparison
 from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.engine import Task
-from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.image_store import RENDERS, REPORT_FOLDER, TEST_FOLDER, TRUTHS, ImageStore
+from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.metric import TimedRenderer
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import contact_sheet
-from aaplug.evaluation.results import Facts, Report
+from aaplug.evaluation.results import CEILING, Facts, Report, method
 from aaplug.evaluation.truth import ViewTruth
 from aaplug.io.atomic import make_folder, replacing
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
-PAGE, PLOTS = "report.html", "plots"
+PAGE, PLOTS, PLOT_SUFFIXES = "report.html", "plots", (".png", ".svg")
+
+
+def remove_run(folder: Path) -> None:
+    """Remove the files that an earlier run wrote, as its journal tells, and folders that are then empty."""
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):  # no journal, or a damaged one
+        with (folder / JOURNAL).open("rb") as stream:
+            request = json.loads(stream.readline())["request"]
+        shown, methods = request["options"]["shown"], product([CEILING, *request["recipes"]], request["scales"])
+        stores = [REPORT_FOLDER] * (shown is not None) + [TEST_FOLDER] * (request["options"].get("layout") == "inria")
+        numbers = [f"{view:05d}.png" for view in range(len(request["view_names"]))]
+        images = product(stores, [method(*each) for each in methods], (RENDERS, TRUTHS), numbers)
+        files = {*map(Path, (JOURNAL, *(COMPARED if "reference" in request else RESULTS))), *(Path(*i) for i in images)}
+        if shown is not None:
+            from aaplug.evaluation.report.plots import ABOVE_NYQUIST, BOUNDS, EVALUATIONS, plot_name
+
+            names = map(plot_name, (*request["metrics"], EVALUATIONS, ABOVE_NYQUIST, BOUNDS))
+            files |= {Path(PAGE), *(Path(PLOTS, name + suffix) for name, suffix in product(names, PLOT_SUFFIXES))}
+        folders = {parent for file in files for parent in file.parents}
+        for path in [*sorted(folder.rglob("*"), reverse=True), folder]:  # a folder comes after what it holds
+            name = path.relative_to(folder)
+            with suppress(OSError):  # the folder is not empty
+                if name in files:
+                    path.unlink()
+                elif name in folders:
+                    path.rmdir()
 
 
 def write_page(
@@ -47,7 +75,7 @@ def write_page(
     paths = write_texts(folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
     beside = make_folder(Path(folder) / PLOTS)
     for plot in figures:
-        for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):
+        for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
             with replacing(beside / (plot.name + suffix), overwrite=True) as stream:
                 stream.write(data)
     return [*paths, beside]

@@ -27,7 +27,7 @@ INK = "#010203"  # placeholder for the colour of the page's text, which is light
 PAPER_INK = "#1c2733"
 FIGURE_INCHES = (5.2, 3.3)
 DPI = 160  # of a PNG
-BOUNDS = "sampling-bounds"
+EVALUATIONS, ABOVE_NYQUIST, BOUNDS = "evaluations", "above-nyquist", "sampling-bounds"  # names of plots
 INK_SETTINGS = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,
@@ -79,15 +79,19 @@ def plots(report: Report, bounds: Coverage) -> list[Plot]:
     """The plots of a report: metrics against the truth and work over scale, and the sampling bounds."""
     curves = []
     for metric in report.compared:
-        name = re.sub(r"\W+", "-", metric.name.lower())
-        curves.append(_curves(name, metric.title, partial(_mean, metric), report))
+        curves.append(_curves(plot_name(metric.name), metric.title, partial(_mean, metric), report))
     title = "million splat-pixel evaluations per view"
-    curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
+    curves.append(_curves(EVALUATIONS, title, million_evaluations, report, from_zero=True))
     title, above = "share of the splats' energy above the Nyquist rate", bounds.above_nyquist
-    curves.append(_curves("above-nyquist", title, lambda _, *at: above.get(at), report, from_zero=True))
+    curves.append(_curves(ABOVE_NYQUIST, title, lambda _, *at: above.get(at), report, from_zero=True))
     share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
     return [*(plot for plot in curves if plot is not None), Plot(BOUNDS, words, partial(_histogram, bounds))]
+
+
+def plot_name(metric: str) -> str:
+    """The name of a metric's plot."""
+    return re.sub(r"\W+", "-", metric.lower())
 
 
 def _mean(metric: Metric, report: Report, recipe: str, scale: float) -> float | None:
