@@ -89,6 +89,11 @@ class Report:
         """Why values are undefined, each reason once."""
         return list(dict.fromkeys(m.note for m in self.measurements if m.note))
 
+    def basis(self, metric: str) -> list[Any]:
+        """What decides on a metric's figures beside scene and recipe; those of another basis do not compare."""
+        parts = ("protocol", "truth", "downscale")
+        return [self.protocol.get("metrics", {}).get(metric), *map(self.protocol.get, parts)]
+
     def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
         """Measurements of every view."""
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
@@ -200,6 +205,8 @@ def metric_grid(
     why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
     if any(scale not in each.scales for each in reports for scale in empty):
         why = "some scenes have other scales"
+    if any(each.basis(metric.name) != report.basis(metric.name) for each in reports):
+        why = "the scenes' protocols differ"
     return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 
 

@@ -68,12 +68,15 @@ class Batch:
         return {"scenes": scenes, "mean_over": over, "mean": self._means() if self.whole else {}}
 
     def _means(self) -> dict[str, dict[str, float | None]]:
-        """By method and metric; None where a scene has no value, as means over different scenes do not compare."""
-        figures, means = [results(report) for report in self.reports.values()], dict[str, dict[str, float | None]]()
-        for name in figures[0] if figures else ():
+        """By method and metric; None where a scene has no value, or one by another protocol: such do not compare."""
+        first, *others = reports = [*self.reports.values()]
+        figures, means = [results(report) for report in reports], dict[str, dict[str, float | None]]()
+        unlike = {m.name for m in first.metrics if any(r.basis(m.name) != first.basis(m.name) for r in others)}
+        for name in figures[0]:
             if name != "_aaplug" and all(name in each for each in figures):
                 values = {key: [each[name].get(key) for each in figures] for key in figures[0][name]}
-                means[name] = {key: None if None in each else fmean(each) for key, each in values.items()}
+                lacking = unlike | {key for key, each in values.items() if None in each}
+                means[name] = {key: None if key in lacking else fmean(each) for key, each in values.items()}
         return means
 
     def tables(self) -> list[Table | str]:
