@@ -158,7 +158,7 @@ def paper(protocol: Protocol, reports: Mapping[str, Report], metric: Metric) -> 
         return metric.text(fmean(known)) + (f" ± {metric.text(stdev(known))}" if len(known) > 1 else "")
 
     rows: list[list[str]] = []
-    if metric.name == "PSNR" and tuple(first.scales) == protocol.scales:
+    if metric.name == "PSNR" and tuple(first.scales) == protocol.scales and not without:
         for method, figures in PUBLISHED.get(protocol.name, {}).items():
             rows.append([f"{method} (published)", *(f"{value:.2f}" for value in figures)])
     for recipe in first.recipes:

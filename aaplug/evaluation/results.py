@@ -213,7 +213,7 @@ def metric_grid(
 def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
     """A table of one line per recipe; ceiling: style of that row."""
     grid = Table(title=escape(title), title_justify="left")
-    grid.add_column(report.row_title, no_wrap=True)
+    grid.add_column(report.row_title, overflow="fold")
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
     for recipe, cells in zip(report.recipes, lines, strict=True):

@@ -100,9 +100,9 @@ def paper_table(paper: Paper) -> Table:
     """The table in print."""
     table = Table(title=escape(paper.title), title_justify="left")
     for i, heading in enumerate(paper.headings):
-        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+        table.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
     for row in paper.rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*(escape(cell).replace(" ±", "\n±") for cell in row))
     return table
 
 
