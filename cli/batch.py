@@ -69,8 +69,9 @@ def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
 
     def run(scene: Words, scheduler: Any, name: str, output: Path, **given: Any) -> Any:
         keywords = told(scene, EvaluateOptions) | {"scheduler": scheduler, "name": name}
-        inputs = read_inputs(scene)
-        return aaplug.evaluate(*inputs, output, **keywords | given)
+        with scene.command.errors("scene"):
+            inputs = read_inputs(scene)
+            return aaplug.evaluate(*inputs, output, **keywords | given)
 
     with running(options, None, lambda: None, (), shared=first.output) as workers:
         runs = [(name, partial(run, scene, workers.cluster)) for name, scene in scenes]
@@ -132,10 +133,11 @@ class _OneScene:
     def __call__(self, scene: Words) -> dict[str, Any] | str:
         from aaplug.verbs.batch import outcome
 
+        run = scene.command.errors("scene")(scene.command.run)
         if self.elsewhere is None:
-            return outcome(lambda: scene.command.run(scene).facts, TERMINAL)
+            return outcome(lambda: run(scene).facts, TERMINAL)
         with quiet(), chdir(self.elsewhere):
-            return outcome(lambda: scene.command.run(scene.where(threads=1)).facts, TERMINAL)
+            return outcome(lambda: run(scene.where(threads=1)).facts, TERMINAL)
 
 
 def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:

@@ -14,7 +14,7 @@ from shutil import get_terminal_size
 from textwrap import fill
 
 from aaplug.system.allocator import keep_freed_memory
-from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason, within_memory
+from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
 from aaplug.system.signals import end_as_by_interrupt
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130  # exit codes
@@ -71,10 +71,9 @@ def _guarded(words: Sequence[str]) -> int:
 
     console.set_up()
     try:
-        with within_memory("aaplug"):
-            return run(words)
+        return run(words)
     except AaplugError as error:
-        console.refuse(_worded(error, words))
+        console.refuse(str(error))
     except RecursionError:
         console.refuse("an input is nested too deeply")
     return REFUSED
@@ -87,9 +86,10 @@ def run(words: Sequence[str]) -> int:
 
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
-        given = command.parse(words[1:])
-        several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
-        answer = command.run(given if several else given.checked())
+        with command.errors("aaplug"):
+            given = command.parse(words[1:])
+            several = given.values.get("batch") is not None  # each scene then has its own options, checked with its file
+            answer = command.run(given if several else given.checked())
         if given.values.get("json"):
             console.print_json(answer.facts)
         elif answer.shown:
@@ -116,13 +116,3 @@ def show_verbs() -> None:
     for name, command in VERBS.items():
         first = command.help.partition("\n\n")[0]
         print(fill(f"  {name:{longest}}  {first}", columns, subsequent_indent=" " * (longest + 4)))
-
-
-def _worded(error: AaplugError, words: Sequence[str]) -> str:
-    """The library's error, with parameters of the verb as its options."""
-    from .verbs import VERBS
-    from .words import worded
-
-    options = VERBS[words[0]].options.values() if words and words[0] in VERBS else []
-    where = worded(f"`{error.where}`", options).strip("`") if isinstance(error, UsageError) else error.where
-    return f"{where}: {worded(error.problem, options)}"

@@ -6,8 +6,8 @@ the heading under which it stands.
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import redirect_stderr, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
 from io import StringIO
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, docs_of, flag
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, AaplugError, UsageError, did_you_mean, within_memory
 
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 OPTION = re.compile(r"-(?![\d.])")  # the beginning of a word that is no negative number
@@ -243,6 +243,18 @@ class Command:
         for name, value in vars(parsed).items():
             values |= vars(value) if is_dataclass(value) else {name: value}
         return Words(self, values)
+
+    @contextmanager
+    def errors(self, what: str) -> Iterator[None]:
+        """Name options in the errors of the block, one of which is that there is no memory for `what`."""
+        try:
+            with within_memory(what):
+                yield
+        except AaplugError as error:
+            options, where = self.options.values(), error.where
+            if isinstance(error, UsageError):
+                where = worded(f"`{where}`", options).strip("`")
+            raise type(error)(where, worded(error.problem, options)) from error
 
     def refusal(self, problem: str) -> UsageError:
         """The error of words that are no command line of this verb."""

@@ -93,6 +93,22 @@ def test_a_mended_scene_is_added_by_resuming_and_the_other_not_redone(batch):
     assert "broken" in Path("out/results.csv").read_text()
 
 
+@pytest.mark.parametrize("verb", ["evaluate", "convert"])
+def test_errors_of_a_scene_name_options_as_they_are_typed(batch, monkeypatch, verb):
+    Path("one.toml").write_text('[[scene]]\nscene = "scene.ply"\ncameras = "."\nmin_seen = 1.0')
+    code, out, err = batch(f"{verb} --batch one.toml -o out --json")
+    assert code == 1
+    assert "lower --min-seen" in json.loads(out)["scenes"]["scene"]["error"]
+    assert "min_seen" not in out + err + Path("out/batch.json").read_text()
+
+    def full(*words, **settings):
+        raise MemoryError
+
+    monkeypatch.setattr(f"aaplug.{verb}", full)
+    code, out, err = batch(f"{verb} --batch one.toml -o out --json --overwrite")
+    assert "fewer --threads" in json.loads(out)["scenes"]["scene"]["error"]
+
+
 def test_scenes_of_the_command_line_share_their_cameras(batch):
     shutil.copy("scene.ply", "other.ply")
     words = "scene.ply other.ply --cameras . -o out --rasterizer eager --recipe matched --scale 0.5 --json"
