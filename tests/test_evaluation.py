@@ -99,8 +99,9 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(look, vie
 
 
 def test_work_without_a_truth_empty_or_doubled_is_refused(look, views):
-    bare = [replace(views[0], photo=None)]
+    bare, nothing = [replace(views[0], photo=None)], Candidate("none", replace(look, scene=look.scene[:0]))
     for given, changes, words in (
+        (views, {"candidates": [nothing]}, "has no Gaussians to measure"),
         (views, {"scales": ()}, "needs at least"),
         (views, {"scales": (0.0,)}, "above 0"),
         (views, {"scales": (1.0, 1.0)}, "named twice"),

@@ -93,6 +93,9 @@ class Task:
         """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs."""
         if not (self.candidates and self.scales and self.views):
             raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
+        for each in self.renderers:
+            if not len(each.scene) and each.in_time is None:
+                raise UsageError(each.scene.name, "has no Gaussians to measure")
         if any(not (scale > 0 and math.isfinite(scale)) for scale in self.scales):
             raise UsageError("scale", f"sizes must be above 0, got {min(self.scales):g}")
         names = {CEILING, *(candidate.name for candidate in self.candidates)}
