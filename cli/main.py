@@ -88,7 +88,7 @@ def run(words: Sequence[str]) -> int:
         command = VERBS[words[0]]
         with command.errors("aaplug"):
             given = command.parse(words[1:])
-            several = given.values.get("batch") is not None  # each scene then has its own options, checked with its file
+            several = given.values.get("batch") is not None  # then each scene's are checked with its file
             answer = command.run(given if several else given.checked())
         if given.values.get("json"):
             console.print_json(answer.facts)

@@ -472,8 +472,8 @@ def bench(words: Words) -> Answer:
     import torch
 
     threads = words.threads or torch.get_num_threads()
-    headings = ("Gaussians", "px", "by")
-    sizes = [(f"{run.gaussians:,}", f"{run.width}x{run.height}", run.rasterizer) for run in runs]
+    headings = ("Gaussians", "px, by")
+    sizes = [(f"{run.gaussians:,}", f"{run.width}x{run.height} {run.rasterizer}") for run in runs]
     figures = [(*size, *(text(run) for text in FIGURES.values())) for size, run in zip(sizes, runs, strict=True)]
     stages = [(*size, *(f"{ms:.0f}" for ms in run.stages_ms.values())) for size, run in zip(sizes, runs, strict=True)]
     unit = "exp/eval: a frame's time for each evaluation, in exponentials of torch"

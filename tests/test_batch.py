@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.journal import JOURNAL, Journal
+from aaplug.evaluation.report.files import RESULTS
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.batch_file import read_batch
 from aaplug.system.errors import ClusterError, FormatError, UsageError
@@ -125,7 +126,7 @@ def test_overwriting_a_batch_removes_scenes_that_it_has_no_more(batch):
     Path("out/c/note.txt").touch()
     assert batch(f"evaluate scene.ply broken.ply {words} --overwrite")[0] == 1
     left = {str(path.relative_to("out")) for path in Path("out").glob("*/*")}
-    assert left == {"c/note.txt", "scene/per_view.json", "scene/progress.jsonl", "scene/results.csv", "scene/results.json"}
+    assert left == {"c/note.txt", *(f"scene/{name}" for name in (JOURNAL, *RESULTS))}
 
 
 def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch):

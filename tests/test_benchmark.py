@@ -12,8 +12,9 @@ from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_3DGS
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.rendering.benchmark import exponent, measure, synthetic_camera, synthetic_scene
+from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from aaplug.verbs.bench import bench
 from aaplug.verbs.lod import lod
 from tests.conftest import make_camera, make_scene
@@ -89,6 +90,15 @@ def test_several_runs_are_a_table_with_exponents(capsys):
     assert "eager: pixels" not in said.out
 
 
+def test_tables_of_large_figures_break_no_word_at_80_columns(capsys, monkeypatch):
+    stages = {"cut": 123.0} | dict.fromkeys(STAGES, 123.0) | {"composite": 123_456.0}
+    rest = 12345.0, 45678.0, 10**8, 10**8, 12.34, stages, 10**11, {"operators": 1234}, 1.0
+    large = Figures("compiled", 1_000_000, 1600, 1060, *rest)
+    monkeypatch.setattr("aaplug.verbs.bench.measure", lambda *_: large)
+    said = run_bench(capsys, "--gaussians", "300")[1].out.split()
+    assert {"1,000,000", "1600x1060", "compiled", *stages, "123456", "45678", "exp/eval", "ns/eval"} <= {*said}
+
+
 def test_the_middle_scene_is_drawn_at_every_size(capsys):
     words = ("--gaussians", "300", "400", "500", "--forward-only", "--json")
     code, said = run_bench(capsys, *words, "--resolution", "40x24", "48x32")
@@ -109,6 +119,11 @@ def model(tmp_path_factory) -> Path:
     lod(scene, cameras, folder / "levels", **how)
     write_scene(folder / "whole.ply", scene)
     return folder
+
+
+def test_a_number_of_gaussians_is_refused_beside_a_scene(model):
+    with pytest.raises(UsageError, match="gaussians: are of synthetic scenes"):
+        bench(model / "whole.ply", gaussians=(300,), rasterizer="eager")
 
 
 @pytest.mark.parametrize("scene", ["levels", "whole.ply"])

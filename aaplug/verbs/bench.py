@@ -41,6 +41,8 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
         scene: see `render`; without one, synthetic ones.
         cameras: see `render`.
     """
+    if scene is not None and tuple(options.gaussians) != BenchOptions.gaussians:
+        raise UsageError("gaussians", "are of synthetic scenes; leave them out, or the scene")
     runs: list[Figures] = []
     with running(options, None, lambda: None, ()):
         if scene is None:
