@@ -70,11 +70,11 @@ def test_a_scene_equals_itself_at_every_scale(cli):
 
 
 def test_tables_break_no_word_at_80_columns(cli, monkeypatch):
-    names = ["a_scene_whose_name_is_long.ply", "another_whose_name_is_long.ply"]
+    names = ["a_scene_whose_name_is_long.ply", "another_whose_name_is_long.ply", "a_third_of_a_length_like_that.ply"]
     for name in names:
         write_scene(name, make_scene(20))
     out = cli(f"compare {' '.join(names)} {WORDS} --min-seen 0 --metric psnr")[1].split()
-    assert [out.count(name) for name in names] == [4, 5]  # the facts, a metric, and two of cost; differences
+    assert [out.count(name) for name in names] == [4, 5, 5]  # the facts, a metric, and two of cost; differences
     for verb in ("viewers", "recipes"):
         narrow = cli(verb)[1]
         with monkeypatch.context() as patch:

@@ -17,6 +17,7 @@ from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size, write_png
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.compare import compare
 from aaplug.verbs.evaluate import evaluate
 from tests.conftest import click, make_camera, make_scene
 
@@ -76,6 +77,14 @@ def test_plots_are_files_too_and_do_not_change(written):
         assert min(image_size(folder / "plots" / f"{name}.png")) > 300
         assert "currentColor" in plot.inline_svg()
     assert not (folder / "plots" / "seconds.svg").exists()  # a curve of times would draw noise
+
+
+def test_curves_of_many_recipes_differ_in_colour_or_marker(written):
+    _, report, found = written
+    many = [replace(m, recipe=f"{m.recipe} {i}") for i in range(12) for m in report.measurements]
+    axes = plots(replace(report, measurements=tuple(many)), found)[0].draw("black").axes[0]
+    looks = {(line.get_color(), line.get_marker()) for line in axes.lines}
+    assert len(looks) == len(axes.lines) == 36
 
 
 def test_tables_show_the_spread_and_the_worst_view_and_times_their_quartiles(written):
@@ -285,6 +294,16 @@ def test_an_address_of_a_section_or_of_nonsense_does_no_harm(opened):
     for address in ("#figures", "#view=gone&scale=7&show=x&split=nan&lens=a,b,c&mode=", "#view=%E0%A4%A"):
         page = opened(address=address)
         assert (data(page, "shown"), data(page, "lens"), data(page, "split")) == (usual, "off", "0.500")
+
+
+def test_tables_of_long_names_are_whole_on_a_desktop(browser, tmp_path, plots_drawn_once):
+    scenes = {f"a_scene_whose_name_is_as_long_as_{name}.ply": make_scene(150, seed) for seed, name in enumerate("abc")}
+    views = tuple(make_camera((place, -4.0, 1.0), name=f"view_at_{place}_metres") for place in (0.0, 2.0))
+    compare(scenes, CameraSet(views, views), tmp_path, metric="psnr", rasterizer="eager", any_frame=True)
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((tmp_path / "report.html").as_uri())
+    assert page.evaluate("[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)")
+    page.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, Int
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from scipy.spatial import KDTree
@@ -38,6 +39,7 @@ GUARDED = (
     "the lowest, over scenes and scales, of the mean PSNR of the views whose images differ, in dB; null if none do"
 )
 UNKNOWN = "–"
+GAP = 3  # characters between columns in print
 
 Say = Callable[[str], None]
 log = logging.getLogger("aaplug")
@@ -260,13 +262,16 @@ class Comparison:
         """The scenes, how their Gaussians differ, and every metric over scales."""
         facts = []
         for title, headings, rows in self.facts():
-            table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-            names, *lines = zip(headings, *rows, strict=True)  # scenes across, as there are more facts than scenes
-            for place, name in enumerate(names):
-                table.add_column(escape(printable(name)), justify="right" if place else "left", overflow="fold")
-            for row in lines:
-                table.add_row(*(escape(printable(cell)) for cell in row))
-            facts.append(table)
+            room = Console().width - max(map(len, headings))
+            across = max(1, room // (GAP + max(len(cell) for row in rows for cell in row)))
+            for first in range(0, len(rows), across):
+                table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+                names, *lines = zip(headings, *rows[first : first + across], strict=True)  # scenes side by side
+                for place, name in enumerate(names):
+                    table.add_column(escape(printable(name)), justify="right" if place else "left", overflow="fold")
+                for row in lines:
+                    table.add_row(*(escape(printable(cell)) for cell in row))
+                facts.append(table)
         return [*facts, *tables(self.report)]
 
     def facts(self) -> list[Facts]:

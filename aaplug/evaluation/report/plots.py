@@ -22,7 +22,7 @@ from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
 COLOURS = ("#3b82f6", "#d97706", "#16a34a", "#db2777", "#8b5cf6", "#0d9aa8", "#a3713d", "#7b8794")
-MARKERS = "osD^vPX*"
+MARKERS = "osD^vPX"  # one less than colours: pairs differ for long
 INK = "#010203"  # placeholder for the colour of the page's text, which is light or dark
 PAPER_INK = "#1c2733"
 FIGURE_INCHES = (5.2, 3.3)
@@ -124,7 +124,8 @@ def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool
         axes.set_xlabel("scale against training")
         if from_zero:
             axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+        columns = 3 if max(map(len, lines)) <= len(CEILING) else 1
+        axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns)
         return figure
 
     return Plot(name, f"{title} over scale, one line per recipe", draw)
