@@ -238,7 +238,7 @@ def video(words: Words) -> Answer:
     Option(
         "fail_under",
         number(0, 200, unit="dB"),
-        "Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB.",
+        "Exit with 1 if the mean PSNR of a scene but the first is below so many dB at any scale: --fail-under 40dB.",
         None,
         REPORT,
     ),

@@ -124,10 +124,12 @@ def test_the_truth_is_the_reference_at_that_size(cli):
 def test_a_viewer_draws_all_and_the_truth_stays(cli):
     words = f"compare scene.ply scene.ply {WORDS} --metric psnr --json"
     shown = json.loads(cli(f"{words} --for classic")[1])["scenes"]["scene.ply"]
-    first, second = json.loads(cli(f"{words} --for mip")[1])["scenes"].values()
+    found = json.loads(cli(f"{words} --for mip")[1])
+    (first, second), guard = found["scenes"].values(), found["guard"]
     assert shown["scales"]["1"]["PSNR"] is None  # as training did
     assert shown["scales"]["0.5"]["PSNR"]["mean"] < 60
     assert first["scales"]["1"]["PSNR"]["mean"] == second["scales"]["1"]["PSNR"]["mean"] < 60
+    assert (guard["scene"], guard["value"] < 60) == ("scene.ply_again", True)  # the first is the yardstick
     code, _, err = cli(f"{words} --for mip --recipe classic")
     assert (code, "--for" in err or "--viewer" in err) == (2, True)
 

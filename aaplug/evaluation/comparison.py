@@ -36,7 +36,7 @@ from aaplug.system.errors import FrameError, printable
 
 SAME_ROWS_DISTANCE = 0.01  # of the scene's size: the median distance within which rows are the same Gaussians
 GUARDED = (
-    "the lowest, over scenes and scales, of the mean PSNR of the views whose images differ, in dB; null if none do"
+    "the lowest, over later scenes and scales, of the mean PSNR of views whose images differ, in dB; null if none do"
 )
 UNKNOWN = "–"
 GAP = 3  # characters between columns in print
