@@ -25,7 +25,7 @@ from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import CEILING, Facts, Report, method
 from aaplug.evaluation.truth import ViewTruth
-from aaplug.io.atomic import make_folder, replacing
+from aaplug.io.atomic import make_folder, refuse_inputs, replacing
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
@@ -37,16 +37,18 @@ def remove_run(folder: Path) -> None:
     with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):  # no journal, or a damaged one
         with (folder / JOURNAL).open("rb") as stream:
             request = json.loads(stream.readline())["request"]
-        shown, methods = request["options"]["shown"], product([CEILING, *request["recipes"]], request["scales"])
-        stores = [REPORT_FOLDER] * (shown is not None) + [TEST_FOLDER] * (request["options"].get("layout") == "inria")
+        shown, layout = request["options"]["shown"], request["options"].get("layout")
+        stores = [REPORT_FOLDER] * (shown is not None) + [TEST_FOLDER] * (layout == "inria")
+        methods = [method(name, scale) for scale in request["scales"] for name in (CEILING, *request["recipes"])]
         numbers = [f"{view:05d}.png" for view in range(len(request["view_names"]))]
-        images = product(stores, [method(*each) for each in methods], (RENDERS, TRUTHS), numbers)
+        images = product(stores, methods, (RENDERS, TRUTHS), numbers)
         files = {*map(Path, (JOURNAL, *(COMPARED if "reference" in request else RESULTS))), *(Path(*i) for i in images)}
         if shown is not None:
             from aaplug.evaluation.report.plots import ABOVE_NYQUIST, BOUNDS, EVALUATIONS, plot_name
 
             names = map(plot_name, (*request["metrics"], EVALUATIONS, ABOVE_NYQUIST, BOUNDS))
             files |= {Path(PAGE), *(Path(PLOTS, name + suffix) for name, suffix in product(names, PLOT_SUFFIXES))}
+        refuse_inputs(folder / file for file in files)
         folders = {parent for file in files for parent in file.parents}
         for path in [*sorted(folder.rglob("*"), reverse=True), folder]:  # a folder comes after what it holds
             name = path.relative_to(folder)
