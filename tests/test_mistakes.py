@@ -103,10 +103,14 @@ def test_a_comma_at_the_end_names_no_view(cli):
     cli.done("render scene.ply --cameras . -o new --views r_0, --scale 0.5")
 
 
-def test_an_empty_scene_is_not_tuned(cli):
+def test_an_empty_scene_is_neither_tuned_nor_measured(cli):
     write_scene("scene.ply", make_scene(0), overwrite=True)
-    for words in ("finetune scene.ply --cameras . -o t.ply", "convert scene.ply --cameras . -o t.ply --for gsplat"):
-        cli.refused(f"{words} --steps 1 --rasterizer eager", "has no Gaussians to tune")
+    for words, use in (
+        ("finetune scene.ply -o t.ply --steps 1", "tune"),
+        ("convert scene.ply -o t.ply --for gsplat --steps 0", "measure"),
+        ("compare scene.ply scene.ply", "measure"),
+    ):
+        cli.refused(f"{words} --cameras . --rasterizer eager", f"has no Gaussians to {use}")
     cli.done("render scene.ply --cameras . -o new --recipe mip-splatting --scale 0.5")
 
 

@@ -110,7 +110,7 @@ def _scales_figure(ink: str) -> Figure:
 def curves(axes: Axes, lines: Table, ink: str) -> None:
     """PSNR over scale of a table, a line per recipe."""
     at = sorted({scale for _, scale in lines})
-    for recipe, colour, marker in zip(CURVES, COLOURS, MARKERS, strict=True):
+    for recipe, colour, marker in zip(CURVES, COLOURS, MARKERS, strict=False):
         values = [float(lines[recipe, scale][PSNR_COLUMN]) for scale in at]
         width, layer = (2.4, 3) if recipe == "auto" else (1.2, 2)
         axes.plot(at, values, marker=marker, ms=5, lw=width, color=colour, label=recipe, zorder=layer)

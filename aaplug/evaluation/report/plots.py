@@ -22,7 +22,7 @@ from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
 COLOURS = ("#3b82f6", "#d97706", "#16a34a", "#db2777", "#8b5cf6", "#0d9aa8", "#a3713d", "#7b8794")
-MARKERS = "osD^vPX"  # one less than colours: pairs differ for long
+MARKERS = "osD^vPX*p"  # one more than colours, so that pairs repeat after 72
 INK = "#010203"  # placeholder for the colour of the page's text, which is light or dark
 PAPER_INK = "#1c2733"
 FIGURE_INCHES = (5.2, 3.3)
