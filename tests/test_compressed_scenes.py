@@ -146,7 +146,7 @@ def test_each_format_is_recognized_and_read_in_parts_and_written_as_ply(tmp_path
         ("scene.lcc", "envscale", "sky", "attributes: envscale is missing"),
         ("lod-meta.json", '"version": 1', '"version": 2', "version should be 1, not 2"),
         ("lod-meta.json", "0_0/meta", "../meta", "names '../meta.json', which leads out of its folder"),
-        ("lod-meta.json", '"count": 25', '"count": 41', "names 41 rows from 0 of .*, which has 40"),
+        ("lod-meta.json", '"count": 25', '"count": 41', "count should be a whole number from 0 to 40, not 41"),
         (
             "lod-meta.json",
             '"offset": 25, "count": 15',

@@ -11,9 +11,8 @@ Both may name a file of far splats, the environment, which belongs to every leve
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.gltf import natural
@@ -32,23 +31,6 @@ TRAILING_COMMA = re.compile(rb",(\s*[}\]])")  # some writers of .lcc2 leave one 
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Rows of a file: its number, the first row, and how many; None for all."""
-
-    file: int
-    start: int
-    count: int | None
-
-
-class Listing(NamedTuple):
-    """What an index names: files, stretches of the finest level, and the file of far splats."""
-
-    files: list[str]
-    stretches: list[Stretch]
-    environment: str | None
-
-
-@dataclass(frozen=True)
 class Rows:
     """Rows of a chunk, as `rows_of` joins them."""
 
@@ -61,15 +43,48 @@ class Rows:
         return self.chunk.load(self.start + start, self.start + stop)
 
 
+@dataclass
+class Chunks:
+    """The files that an index names, each of which is opened once, in its folder."""
+
+    path: Path
+    options: SceneFileOptions
+    opened: dict[str, Scene] = field(default_factory=dict)
+
+    def open(self, name: str) -> Scene:
+        """One file."""
+        if name in self.opened:
+            return self.opened[name]
+        file = self.path.parent / name
+        if not file.resolve().is_relative_to(self.path.parent.resolve()):
+            raise FormatError(self.path, f"names {name!r}, which leads out of its folder")
+        head = read_start(file, HEAD_BYTES)
+        if sog.sniff(file, head):
+            self.opened[name] = sog.open_scene(file, self.options)
+        elif spz.sniff(file, head):
+            axes = "opencv" if self.options.spz_axes == "auto" else self.options.spz_axes  # SOGs' in such an index
+            self.opened[name] = spz.open_scene(file, replace(self.options, spz_axes=axes))
+        else:
+            raise FormatError(self.path, f"names {name!r}, which is neither a SOG nor a .spz")
+        return self.opened[name]
+
+    def rows(self, names: list[str], entry: Entry, key: str, start: str) -> Rows:
+        """The rows that an entry names by the number of the file, their first one and how many, or all from there."""
+        chunk = self.open(names[natural(entry.value(key), entry.place, key, len(names) - 1)])
+        first = natural(entry.fields.get(start, 0), entry.place, start, chunk.count)
+        left = chunk.count - first
+        return Rows(chunk, first, natural(entry.fields.get("count", left), entry.place, "count", left))
+
+
 @dataclass(frozen=True)
 class ChunkedFormat:
     """Indexes of one suffix.
 
-    listing: reads the root.  turned: puts the scene into OpenCV's axes.
+    pieces: of the finest level and the environment, from the root.  turned: puts the scene into OpenCV's axes.
     """
 
     name: str
-    listing: Callable[[Entry], Listing]
+    pieces: Callable[[Entry, Chunks], list[Rows]]
     turned: Callable[[Gaussians], Gaussians] = lambda scene: scene
     notes: tuple[str, ...] = ()
 
@@ -78,56 +93,27 @@ class ChunkedFormat:
         return f".{path.name.lower()}".endswith(f".{self.name}") and head.lstrip().startswith(b"{")
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
-        """The finest level and the far splats; see `SceneFormat`."""
+        """The finest level and the environment; see `SceneFormat`."""
         with library_errors(path):
-            data = TRAILING_COMMA.sub(rb"\1", read_bounded(path, whole_limit("JSON")))
-            listing = self.listing(object_of(parse_json(data, path), path, "its tree", "a tree of chunks"))
-            numbers = sorted({stretch.file for stretch in listing.stretches})
-            chunks = {number: _chunk(path, listing.files[number], options) for number in numbers}
-            pieces = [_rows(path, chunks[stretch.file], stretch) for stretch in listing.stretches]
-            count, held = (sum(each.count for each in several) for several in (pieces, chunks.values()))
-            if count > held or not chunks:
-                raise FormatError(path, f"names {count:,} Gaussians in files that hold {held:,}")
-            opened = [*chunks.values()]
-            if listing.environment is not None:
-                opened.append(_chunk(path, listing.environment, options))
-                pieces.append(Rows(opened[-1], 0, opened[-1].count))
-        first, count = opened[0], sum(piece.count for piece in pieces)
+            data, chunks = TRAILING_COMMA.sub(rb"\1", read_bounded(path, whole_limit("JSON"))), Chunks(path, options)
+            pieces = self.pieces(object_of(parse_json(data, path), path, "its tree", "a tree of chunks"), chunks)
+        opened, count = [*chunks.opened.values()], sum(piece.count for piece in pieces)
+        held = sum(chunk.count for chunk in opened)
+        if count > held or not opened:
+            raise FormatError(path, f"names {count:,} Gaussians in files that hold {held:,}")
         check_count(path, count)
+        first, degree = opened[0], max(chunk.sh_degree for chunk in opened)
         for chunk in opened:
             if (chunk.convention, chunk.fused, chunk.flat) != (first.convention, first.fused, first.flat):
                 raise FormatError(path, f"names files of several rules of drawing: {first.path}, {chunk.path}")
-        degree = max(chunk.sh_degree for chunk in opened)
-        others = tuple(file for chunk in opened for file in (chunk.path, *chunk.others) if file is not None)
-        notes = (f"the finest level, in {counted(len(chunks), 'file')}", *self.notes)
+        others = tuple(file for chunk in opened for file in chunk.files)
+        notes = (f"the finest level, in {counted(len(opened), 'file')}", *self.notes)
 
         def load(start: int, stop: int) -> Gaussians:
             return self.turned(rows_of(pieces, degree, start, stop))
 
         said = {"convention": first.convention, "fused": first.fused, "flat": first.flat, "others": others}
         return Scene(path, self.name, count, degree, load, first.evidence, notes=notes, **said)
-
-
-def _chunk(path: Path, name: str, options: SceneFileOptions) -> Scene:
-    """A file of Gaussians in the folder of the index."""
-    file = path.parent / name
-    if not file.resolve().is_relative_to(path.parent.resolve()):
-        raise FormatError(path, f"names {name!r}, which leads out of its folder")
-    head = read_start(file, HEAD_BYTES)
-    if sog.sniff(file, head):
-        return sog.open_scene(file, options)
-    if spz.sniff(file, head):
-        axes = "opencv" if options.spz_axes == "auto" else options.spz_axes  # as those of SOGs in such an index
-        return spz.open_scene(file, replace(options, spz_axes=axes))
-    raise FormatError(path, f"names {name!r}, which is neither a SOG nor a .spz")
-
-
-def _rows(path: Path, chunk: Scene, stretch: Stretch) -> Rows:
-    start, left = stretch.start, chunk.count - stretch.start
-    count = left if stretch.count is None else stretch.count
-    if not 0 <= count <= left:
-        raise FormatError(path, f"names {count:,} rows from {start:,} of {chunk.path}, which has {chunk.count:,}")
-    return Rows(chunk, start, count)
 
 
 def _nodes(root: Entry, children: str) -> Iterator[tuple[Entry, bool]]:
@@ -148,30 +134,24 @@ def _names(value: object, place: Place, field: str) -> list[str]:
     return [text(each, place, field) for each in value] if isinstance(value, list) else []
 
 
-def _stretch(entry: Entry, key: str, start: str, files: list[str]) -> Stretch:
-    most, place = whole_limit("GAUSSIANS"), entry.place
-    first = natural(entry.fields.get(start, 0), place, start, most)
-    count = natural(entry.value("count"), place, "count", most) if "count" in entry else None
-    return Stretch(natural(entry.value(key), place, key, len(files) - 1), first, count)
-
-
-def _streamed_sog(root: Entry) -> Listing:
-    version, files = root.value("version"), root.get("filenames", _names)
+def _streamed_sog(root: Entry, chunks: Chunks) -> list[Rows]:
+    version, names = root.value("version"), root.get("filenames", _names)
     root.place.expect(version == 1, "version", "1", version)
     levels = [node.entry("lods") for node, _ in _nodes(root.entry("tree"), "children") if "lods" in node]
-    stretches = [_stretch(level.entry("0"), "file", "offset", files) for level in levels if "0" in level]
-    environment = root.get("environment", text) if "environment" in root else None
-    return Listing(files, stretches, environment)
+    pieces = [chunks.rows(names, level.entry("0"), "file", "offset") for level in levels if "0" in level]
+    if "environment" in root:
+        far = chunks.open(root.get("environment", text))
+        pieces.append(Rows(far, 0, far.count))
+    return pieces
 
 
-def _lcc2(root: Entry) -> Listing:
+def _lcc2(root: Entry, chunks: Chunks) -> list[Rows]:
     tree = root.entry("root")
-    files = tree.get("splatFiles" if "splatFiles" in tree else "files", _names)
-    held = [node.entry("data") for node, leaf in _nodes(tree, "child") if leaf and "data" in node]
-    stretches = [_stretch(data.entry("3dgs"), "name", "start", files) for data in held if "3dgs" in data]
+    names = tree.get("splatFiles" if "splatFiles" in tree else "files", _names)
+    leaves = [node.entry("data") for node, leaf in _nodes(tree, "child") if leaf and "data" in node]
+    pieces = [chunks.rows(names, data.entry("3dgs"), "name", "start") for data in leaves if "3dgs" in data]
     far = tree.entry("data") if "data" in tree else tree
-    number = natural(far.entry("env").value("name"), tree.place, "env", len(files) - 1) if "env" in far else None
-    return Listing(files, stretches, None if number is None else files[number])
+    return [*pieces, chunks.rows(names, far.entry("env"), "name", "start")] if "env" in far else pieces
 
 
 FORMATS = (ChunkedFormat("lod-meta.json", _streamed_sog), ChunkedFormat("lcc2", _lcc2, turned_from_z_up, (CREDIT,)))
