@@ -298,8 +298,9 @@ def test_parts_are_for_their_viewer_also_without_tuning(tmp_path, to, viewer):
     made(tmp_path / "out", to)
     for folder in streamed.part_folders(tmp_path / "out", to):
         assert read_scene(folder / streamed.STREAMS[to].content).convention == VIEWERS[viewer].convention
-    with pytest.raises(FormatError, match=f"holds levels for another viewer .{streamed.STREAMS[to].index}.; name"):
-        read_scene(tmp_path / "out")
+    if to != "sog":
+        with pytest.raises(FormatError, match=f"holds levels for another viewer .{streamed.STREAMS[to].index}.; name"):
+            read_scene(tmp_path / "out")
 
 
 def test_a_page_has_the_viewer_beside_it(tmp_path):

@@ -19,7 +19,7 @@ from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, remove_run, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, metric_grid, results
-from aaplug.io.atomic import AnyPath, refuse_existing, writing
+from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs, writing
 from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, ClusterError, counted, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
@@ -156,8 +156,6 @@ def batch(
     check()
     reports, failures = dict[str, Report](), dict[str, str]()
     with writing(output, check, (), folder=True):
-        if overwrite:
-            _remove_batch(Path(output))
         for folder, (name, run) in zip(folders, runs, strict=True):
             monitor.say(f"--- {name}")
             options = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite, "monitor": monitor}
@@ -172,6 +170,8 @@ def batch(
         if resume and not reports and (Path(output) / SUMMARY).exists():
             monitor.say(f"no scene finished: {Path(output) / SUMMARY} and what is beside it stay as they were")
             return done
+        if overwrite:
+            _remove_rest(Path(output), names)
         texts = {SUMMARY: as_json(done.summary()), RESULTS: as_csv(reports)}
         if papers := done.papers():
             texts[TABLE] = "\n".join(paper.as_latex() for paper in papers)
@@ -180,15 +180,15 @@ def batch(
     return done
 
 
-def _remove_batch(output: Path) -> None:
-    """Remove what an earlier batch wrote, as its summary tells."""
+def _remove_rest(output: Path, names: Mapping[str, str]) -> None:
+    """Remove what an earlier batch wrote beyond the scenes of these names, as its summary tells."""
     with suppress(OSError, ValueError, LookupError, TypeError):  # no summary, or a damaged one
         scenes = json.loads((output / SUMMARY).read_bytes())["scenes"]
         for journal in output.glob(f"*/{JOURNAL}"):
-            if journal.parent.name in scenes:
+            if journal.parent.name in scenes and journal.parent.name not in names:
                 remove_run(journal.parent)
-        for name in (RESULTS, TABLE, SUMMARY):
-            (output / name).unlink(missing_ok=True)
+        refuse_inputs([output / TABLE])
+        (output / TABLE).unlink(missing_ok=True)
 
 
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
