@@ -13,8 +13,8 @@ from aaplug.core.rules import Rules
 from aaplug.core.sampling import median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods import FORMS, RECIPES
-from aaplug.methods.conversion import FITTED_VARIANCE, fuse, fuse_for
+from aaplug.methods import RECIPES
+from aaplug.methods.conversion import FITTED_VARIANCE, FORMS, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.presets import recipe_of

@@ -12,8 +12,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.survey import Histogram, check_frame_of, survey
 from aaplug.io.scenes import read_scene, write_parts, write_scene
-from aaplug.methods import FORMS
-from aaplug.methods.conversion import fuse
+from aaplug.methods.conversion import FORMS, fuse
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
 from aaplug.verbs.convert import convert_parts

@@ -13,8 +13,7 @@ import torch
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods import FORMS
-from aaplug.methods.conversion import fuse
+from aaplug.methods.conversion import FORMS, fuse
 from tests.scene_files import ORACLE
 
 OLDEST = 3  # major version: before, it wrote .spz in other axes and without a flag

@@ -4,7 +4,7 @@ Where tuning made one worse, parts of the change are tried, and then the closed 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
@@ -28,14 +28,6 @@ MAX_VIEWS = 8  # evenly spaced, that scenes are compared on
 ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report
 
 
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A scene for a viewer.  report: original, closed form and result as the viewer shows them."""
-
-    scene: Gaussians
-    report: Report
-
-
 def steps_for(scene: Gaussians, viewer: Viewer) -> int:
     """The usual number of steps: none for a viewer that draws as training did."""
     return 0 if scene.convention == viewer.convention_of(scene) else QUICK_SETTINGS.steps
@@ -43,8 +35,8 @@ def steps_for(scene: Gaussians, viewer: Viewer) -> int:
 
 def fit(
     scene: Gaussians, viewer: Viewer, look: Renderer, views: Sequence[Camera], steps: int, monitor: Monitor = SILENT
-) -> Fitted:
-    """Convert a scene for a viewer; raises as `fuse_for` and `tune` do.
+) -> tuple[Gaussians, Report]:
+    """A scene for a viewer, and original, closed form and result as it shows them; raises as `fuse_for` and `tune` do.
 
     look: draws the scene as training showed it, which the viewer should show.
     views: to measure on; a few of them are taken.
@@ -88,7 +80,7 @@ def fit(
         if kept:
             result = start.scene
             report = report_of(result)
-    return Fitted(result, report)
+    return result, report
 
 
 def _is_worse(report: Report, name: str) -> bool:

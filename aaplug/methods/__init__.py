@@ -9,7 +9,6 @@ from aaplug.system.registry import Registry
 
 if TYPE_CHECKING:
     from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
-    from aaplug.methods.conversion import Form
     from aaplug.methods.recipe import Recipe
 
 RateReference = Literal["pose", "global", "sharpest", "interval"]  # what `matched` divides a sampling rate by
@@ -53,14 +52,6 @@ PIXEL_KERNELS: Registry["PixelKernel"] = Registry(
     },
 )
 COMPOSITORS: Registry["Compositor"] = Registry("compositor", "aaplug.core.interfaces:Compositor", {})
-FORMS: Registry["Form"] = Registry(
-    "form",
-    "aaplug.methods.conversion:Form",
-    {
-        "matched-energy": "aaplug.methods.conversion:MATCHED_ENERGY",
-        "mip-splatting": "aaplug.methods.conversion:MIP_SPLATTING",
-    },
-)
 RECIPES: Registry["Recipe"] = Registry(
     "recipe",
     "aaplug.methods.recipe:Recipe",

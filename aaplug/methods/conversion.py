@@ -6,7 +6,6 @@ independently; `aaplug.finetuning` can then optimize all of them together.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from aaplug.core.conventions import MIP, Convention
 from aaplug.core.gaussians import Fusion, Gaussians
@@ -33,14 +32,10 @@ class Form:
     uses_bounds: bool
     skips: Convention | None = None
 
-    def with_variance(self, variance: float) -> "Form":
-        """The same form with another fused variance, in px² at the training rate."""
-        filter_: Any = replace(self.filter, variance=variance)
-        return replace(self, filter=filter_)
-
 
 MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
 MIP_SPLATTING = Form(Smoothing3D(), uses_bounds=True)
+FORMS = {"matched-energy": MATCHED_ENERGY, "mip-splatting": MIP_SPLATTING}
 
 
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:

@@ -182,7 +182,7 @@ class ConvertOptions(WritingOptions, ViewOptions):
     """Fit the scene to spark, playcanvas or another of `aaplug guide viewers`, and print the remaining error."""
     steps: Annotated[int | None, STEPS] = None
     """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
-    form: Annotated[str | None, names(kind="form")] = None
+    form: Annotated[str | None, names("matched-energy", "mip-splatting")] = None
     """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
     variance: Annotated[float | None, number(0.001, 100)] = None
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""

@@ -30,7 +30,6 @@ REGISTRIES = {  # place of each kind's registry; a kind's plural, with underscor
     "compositor": "aaplug.methods:COMPOSITORS",
     "recipe": "aaplug.methods:RECIPES",
     "viewer": "aaplug.methods.viewers:VIEWERS",
-    "form": "aaplug.methods:FORMS",
     "rasterizer": "aaplug.rasterizers:RASTERIZERS",
     "metric": "aaplug.evaluation:METRICS",
     "protocol": "aaplug.evaluation:PROTOCOLS",

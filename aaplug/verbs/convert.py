@@ -19,8 +19,7 @@ from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
 from aaplug.io.scenes.scene import PART, Scene, SceneFrames
-from aaplug.methods import FORMS
-from aaplug.methods.conversion import MATCHED_ENERGY, MIP_SPLATTING, Form, blurring, fuse
+from aaplug.methods.conversion import FORMS, Form, blurring, fuse
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -75,8 +74,13 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
     job, path = Job.of(scene, cameras, options), None if output is None else Path(output)
-    rule = _rule(options, job.scene.flat)
-    viewer = rule if isinstance(rule, Viewer) else DISC_VIEWER if job.scene.flat else MIP_VIEWER
+    rule: Form | Viewer | None = find_viewer(options.viewer)
+    viewer = rule or (DISC_VIEWER if job.scene.flat else MIP_VIEWER)
+    if rule is None:
+        rule = FORMS[options.form or ("mip-splatting" if job.scene.flat else "matched-energy")]
+        if options.variance is not None:
+            how: Any = replace(rule.filter, variance=options.variance)
+            rule = replace(rule, filter=how)
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     frames = job.scene.frames
     if frames is not None and isinstance(rule, Viewer):
@@ -97,16 +101,6 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         if path is not None:
             write_scene(path, fused, **files)
     return Converted(len(fused), fused, viewer, report)
-
-
-def _rule(options: ConvertOptions, flat: bool) -> Form | Viewer:
-    """The rule to convert for: a viewer's, or the Mip rule by a closed form; flat: of 2D Gaussians."""
-    viewer = find_viewer(options.viewer)
-    if viewer is not None:
-        return viewer
-    default = MIP_SPLATTING if flat else MATCHED_ENERGY
-    form = default if options.form is None else FORMS.find(options.form, "form")
-    return form if options.variance is None else form.with_variance(options.variance)
 
 
 def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
@@ -200,5 +194,4 @@ def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> tuple[Gaussians, Report
     steps = steps_for(gaussians, viewer) if job.options.steps is None else job.options.steps
     look = job.look(steps, gradients=True)
     job.say_assumed(look)
-    fitted = fit(gaussians, viewer, look, job.views, steps, job.monitor)
-    return fitted.scene, fitted.report
+    return fit(gaussians, viewer, look, job.views, steps, job.monitor)

@@ -236,8 +236,7 @@ class _Maker:
         if self.viewer is not None and level.scene is self.scene:
             usual = steps_for(self.scene, self.viewer)
             steps = options.steps if usual and options.steps is not None else usual
-            fitted = fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)
-            return level._replace(scene=fitted.scene)
+            return level._replace(scene=fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)[0])
         smaller = SMALLER_IMAGES if options.single and self.viewer is None else ()
         how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller, beside)
         scene = refine(level.scene, level.rate, look, *how)

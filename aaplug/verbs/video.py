@@ -1,7 +1,7 @@
 """A video of a scene along a camera path, one recipe or two side by side."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import starmap
@@ -22,7 +22,7 @@ from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video, write_video
-from aaplug.options.verbs import RECEDING_PATHS, VideoOptions
+from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -72,9 +72,10 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     alone = sequence is not None or options.lens == "vr180"
     if alone and options.beside not in ("classic", "none", None):
         raise UsageError("beside", "is for videos of one eye; a frame sequence and vr180 show `recipe` alone")
-    if str(options.path) not in PATHS and not os.path.exists(options.path):
-        raise UsageError("path", f"takes {listing([*PATHS])} or a file of cameras; there is no {options.path}")
-    file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
+    built_in = str(options.path) in BUILT_IN_PATHS
+    if not built_in and not os.path.exists(options.path):
+        raise UsageError("path", f"takes {listing(BUILT_IN_PATHS)} or a file of cameras; there is no {options.path}")
+    file = None if built_in else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
     if sequence is None:
@@ -165,27 +166,16 @@ def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
     count = max(1, round(options.seconds * fps))
     if count > MAX_FRAMES:
         raise UsageError("seconds", f"makes {count:,} frames; the limit is {MAX_FRAMES:,}")
-    view = job.views[0]
-    job.monitor.say(f"path: {options.path} from view {view.name}")
-    return camera_paths.frames(PATHS[str(options.path)](job, view), count)
-
-
-PATHS: dict[str, Callable[[Job[VideoOptions], Camera], Callable[[float], Camera]]] = {  # cameras of t in [0, 1)
-    "zoom": lambda job, view: partial(camera_paths.zoom, view, start=job.options.start, end=job.options.end),
-    "dolly": lambda job, view: partial(
-        camera_paths.dolly,
-        view,
-        start=job.options.start,
-        end=job.options.end,
-        depth=median_depth(job.scene.gaussians().means, view),
-    ),
-    "orbit": lambda job, view: partial(
-        camera_paths.orbit,
-        view,
-        depth=median_depth(job.scene.gaussians().means, view),
-        up=camera_paths.up_of(job.cameras),
-    ),
-}
+    view, name, ends = job.views[0], str(options.path), {"start": options.start, "end": options.end}
+    job.monitor.say(f"path: {name} from view {view.name}")
+    if name == "zoom":
+        return camera_paths.frames(partial(camera_paths.zoom, view, **ends), count)
+    depth = median_depth(job.scene.gaussians().means, view)
+    if name == "dolly":
+        return camera_paths.frames(partial(camera_paths.dolly, view, **ends, depth=depth), count)
+    return camera_paths.frames(
+        partial(camera_paths.orbit, view, depth=depth, up=camera_paths.up_of(job.cameras)), count
+    )
 
 
 def side_by_side(

@@ -22,7 +22,7 @@ SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixe
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
 Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
-LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
+LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
 
 
 def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
@@ -134,12 +134,8 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: 
 
 def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
     """Names fit for files; all are numbered where two would be the same."""
-    slugs = [_cut(re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless) for name in names]
+    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless for name in names]
+    slugs = [slug.encode()[:LONGEST_NAME].decode(errors="ignore") for slug in slugs]
     if len({slug.casefold() for slug in slugs}) < len(slugs):
         return [f"{index:0{digits}d}_{slug}" for index, slug in enumerate(slugs)]
     return slugs
-
-
-def _cut(slug: str) -> str:
-    """The name, cut to what every file system takes."""
-    return slug.encode()[:LONGEST_NAME].decode(errors="ignore")
