@@ -1,10 +1,10 @@
 """Finding the recipe that a user means, and fitting it to a scene."""
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, get_args
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.methods import QUALITIES, RECIPES, SplatOrder
+from aaplug.methods import QUALITIES, RECIPES, RateReference, SplatOrder
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.recipe import Recipe, set_by
 from aaplug.system.contracts import Range, contract
@@ -38,7 +38,10 @@ def find_recipe(
     if rate_reference is not None:
         if not isinstance(recipe.screen, Matched):
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
-        recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
+        references = get_args(RateReference)
+        if rate_reference not in references:
+            raise UsageError("rate_reference", not_one_of(rate_reference, references))
+        recipe = replace(recipe, screen=replace(recipe.screen, reference=rate_reference))
     if order != recipe.order:
         recipe = replace(recipe, order=order)
     if recipe.takes_quality:

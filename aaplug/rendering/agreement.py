@@ -10,7 +10,7 @@ from statistics import median
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.cameras import CameraSet, spread
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
@@ -102,26 +102,23 @@ def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scen
 
 @torch.no_grad()
 def _gain(look: Renderer, cameras: CameraSet) -> float | None:
-    """Median gain over a few photographs; those that cannot be read do not count."""
+    """PSNR of small renders over that of the photographs' mean colours, in dB, each on the background that fits.
+
+    It is the median over a few photographs; those that cannot be read do not count.
+    """
     views = [view for view in cameras.all if view.photo is not None]
     if not views or not 0 < len(look.scene) <= LARGEST:
         return None
     gains = []
     for view in spread(views, PHOTOGRAPHS):
+        small = view.scaled(min(1.0, SIDE / max(view.hw)))
         try:
-            gains.append(_gain_at(look, view))
+            truth, (rgb, alpha) = photo_at(view, small, look.background), look(small)
         except AaplugError:
             continue
+        behind = (1 - alpha)[..., None] * truth.new_tensor([[[colour]] for colour in (BLACK, WHITE, look.background)])
+        images = (rgb - behind[2] + behind).clamp(0, 1)
+        error = (images - truth).square().mean(dim=(1, 2, 3)).min()
+        flat = (truth - truth.mean(dim=(0, 1))).square().mean()
+        gains.append(float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10()))
     return median(gains) if gains else None
-
-
-def _gain_at(look: Renderer, view: Camera) -> float:
-    """PSNR of the small render over that of the small photograph's mean colour, in dB, on the background that fits."""
-    assert view.photo is not None
-    small = view.scaled(min(1.0, SIDE / max(view.hw)))
-    truth, (rgb, alpha) = photo_at(view, small, look.background), look(small)
-    behind = (1 - alpha)[..., None] * truth.new_tensor([[[colour]] for colour in (BLACK, WHITE, look.background)])
-    images = (rgb - behind[2] + behind).clamp(0, 1)
-    error = (images - truth).square().mean(dim=(1, 2, 3)).min()
-    flat = (truth - truth.mean(dim=(0, 1))).square().mean()
-    return float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10())

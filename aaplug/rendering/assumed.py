@@ -27,7 +27,6 @@ from aaplug.options.shared import DEFAULT_FOV, Orbit, size_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, UsageError
-from aaplug.system.monitor import Monitor
 
 TRAIN_VIEW = (WIDTH_CAP, WIDTH_CAP * 2 // 3)  # px: the width that 3DGS trains at by default, in a camera's usual shape
 ORBIT_VIEWS = 8
@@ -110,8 +109,13 @@ def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, .
     fov = math.radians(orbit.fov)
     centre = frame.centre if orbit.look_at is None else frame.centre.new_tensor(orbit.look_at)
     if orbit.eye is not None:
-        pose = _pose(frame.centre.new_tensor(orbit.eye), centre, frame)
-        return (centred("eye", size, min(size) / 2 / math.tan(fov / 2), pose),)
+        eye = frame.centre.new_tensor(orbit.eye)
+        sight = centre - eye
+        if not float(sight.norm()) > 0:
+            raise UsageError("eye", "and the place to look at are the same; move one")
+        beside = torch.linalg.cross(sight / sight.norm(), frame.up).norm()
+        up = frame.up if float(beside) > 1e-6 else frame.front  # which points up where up is the direction of sight
+        return (centred("eye", size, min(size) / 2 / math.tan(fov / 2), look_at(eye, centre, up)),)
     elevation = math.radians(ELEVATION if orbit.elevation is None else orbit.elevation)
     views = orbit_views(replace(frame, centre=centre), orbit.orbit or ORBIT_VIEWS, size, elevation, fov)
     if orbit.look_at is not None or orbit.fov != DEFAULT_FOV:
@@ -122,22 +126,6 @@ def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, .
 def rate_of(cameras: CameraSet, frame: Frame) -> float:
     """The assumed training rate in the middle of the frame, px per world unit."""
     return cameras.train[0].focal / frame.distance(math.radians(DEFAULT_FOV))
-
-
-def say_assumed(
-    cameras: CameraSet, monitor: Monitor, renderer: Renderer | None = None, view: Camera | None = None
-) -> None:
-    """Say what is assumed, and how much a picture hangs on it; nothing where the cameras are known.
-
-    view: the picture; None for the first test view at the training size.
-    """
-    if not cameras.assumed:
-        return
-    for note in cameras.notes:
-        monitor.say(note)
-    if renderer is not None:
-        half, twice = decibels_at(renderer, view or cameras.test[0], (0.5, 2.0))
-        monitor.say(f"with half that rate the image would be {_apart(half)}, with twice {_apart(twice)}")
 
 
 @torch.no_grad()
@@ -156,10 +144,6 @@ def decibels_at(renderer: Renderer, view: Camera, factors: Sequence[float]) -> l
     return decibels
 
 
-def _apart(decibels: float) -> str:
-    return "the same" if decibels == math.inf else f"{decibels:.0f} dB from this one"
-
-
 def _width_in_run(path: Path | None) -> int | None:
     """The width in px that a training run's `cfg_args` beside the file, or in its model folder, states."""
     if path is None:
@@ -171,12 +155,3 @@ def _width_in_run(path: Path | None) -> int | None:
             continue
         return None if resolution in (CAPPED, *DIVISORS) else int(resolution)
     return None
-
-
-def _pose(eye: torch.Tensor, target: torch.Tensor, frame: Frame) -> torch.Tensor:
-    """`look_at` with the frame's up; where that is the direction of sight, its front points up in the image."""
-    sight = target - eye
-    if not float(sight.norm()) > 0:
-        raise UsageError("eye", "and the place to look at are the same; move one")
-    beside = torch.linalg.cross(sight / sight.norm(), frame.up).norm()
-    return look_at(eye, target, frame.up if float(beside) > 1e-6 else frame.front)

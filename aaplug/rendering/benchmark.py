@@ -127,14 +127,12 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
     )
 
 
-def gradient_step(renderer: Renderer, camera: Camera) -> dict[str, Tensor]:
+def gradient_step(renderer: Renderer, camera: Camera) -> None:
     """One render, and the gradient of its mean square with respect to all parameters of the scene."""
-    scene = renderer.scene
     names = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    leaves = {name: getattr(scene, name).detach().requires_grad_() for name in names}
-    image = replace(renderer, scene=replace(scene, **leaves))(camera)
-    grads = torch.autograd.grad(image.rgb.square().mean(), list(leaves.values()))
-    return dict(zip(names, grads, strict=True))
+    leaves = {name: getattr(renderer.scene, name).detach().requires_grad_() for name in names}
+    image = replace(renderer, scene=replace(renderer.scene, **leaves))(camera)
+    torch.autograd.grad(image.rgb.square().mean(), list(leaves.values()))
 
 
 def exponent(sizes: list[float], times: list[float]) -> float:

@@ -5,6 +5,7 @@ claims the output and connects the workers.
 """
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ from aaplug.options.shared import FrameOptions, Orbit, RecipeOptions, ViewOption
 from aaplug.options.verbs import ALL, IN_TIME
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.agreement import agreement, settled
-from aaplug.rendering.assumed import cameras_around, say_assumed
+from aaplug.rendering.assumed import cameras_around, decibels_at
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
@@ -180,8 +181,18 @@ class Job(Generic[O_co]):
         return [suited(recipe, gaussians) for recipe in recipes if lacks[recipe.name] is None]
 
     def say_assumed(self, renderer: Renderer | None = None, view: Camera | None = None) -> None:
-        """Say which training is assumed, and how much a picture hangs on it; see `assumed.say_assumed`."""
-        say_assumed(self.cameras, self.monitor, renderer, view)
+        """Say which training is assumed, if any, and how much a picture hangs on it.
+
+        view: the picture; None for the first test view at the training size.
+        """
+        if not self.cameras.assumed:
+            return
+        for note in self.cameras.notes:
+            self.monitor.say(note)
+        if renderer is not None:
+            decibels = decibels_at(renderer, view or self.cameras.test[0], (0.5, 2.0))
+            half, twice = ("the same" if dB == math.inf else f"{dB:.0f} dB from this one" for dB in decibels)
+            self.monitor.say(f"with half that rate the image would be {half}, with twice {twice}")
 
     def announce(
         self,

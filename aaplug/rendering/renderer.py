@@ -432,7 +432,11 @@ class Renderer:
         splats = concatenated(parts)
         if self.recipe.order == "tile":
             splats = with_ray_slopes(splats, self.scene, camera)
-        _check_colours(splats)
+        colours = splats.rgb
+        assert colours is not None
+        if not colours.sum().isfinite() and (bad := ~colours.isfinite().all(dim=1)).any():
+            first, count = int(splats.sources[bad].min()), int(bad.sum())
+            raise UsageError(f"Gaussian {first}", f"has no finite colour (the first of {count})")
         return with_copies(splats, self.training.convention.rules)
 
     def _projected(
@@ -502,14 +506,3 @@ def background_colour(background: Background, cameras: object = None) -> Colour:
         return (cameras.background if isinstance(cameras, CameraSet) else None) or BLACK
     red, green, blue = colour_of(background) if isinstance(background, str) else background
     return red, green, blue
-
-
-def _check_colours(splats: Splats2D) -> None:
-    """Raise on NaN or infinite colours, which would contaminate every pixel that they touch."""
-    colours: Tensor | None = splats.rgb
-    assert colours is not None
-    if not colours.sum().isfinite():
-        bad = ~colours.isfinite().all(dim=1)
-        if bad.any():
-            first, count = int(splats.sources[bad].min()), int(bad.sum())
-            raise UsageError(f"Gaussian {first}", f"has no finite colour (the first of {count})")

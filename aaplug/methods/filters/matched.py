@@ -13,7 +13,6 @@ Design and measurements are aaplug's own.  Step one with one global rate is SA-G
 
 import math
 from dataclasses import dataclass, replace
-from typing import cast, get_args
 
 import torch
 from jaxtyping import Float
@@ -23,7 +22,6 @@ from aaplug.core.cameras import Camera
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.methods import RateReference
-from aaplug.system.errors import UsageError, not_one_of
 
 # px²: variance of a pixel's own filter, as a Gaussian.  A box has 1/12, Mip-Splatting takes 0.1.  Opaque splats side by
 # side hide less than their energies add up to, and a narrower filter offsets some of that (examples/guides/methods.md).
@@ -68,17 +66,6 @@ class Matched:
             return replace(matched, window=window)
         rest = self.pixel_variance * (1 - rate * rate).clamp(min=0.0)
         return matched.blurred(rest, compensate=True)
-
-    def with_reference(self, reference: str) -> "Matched":
-        """The same filter with another reference.
-
-        Raises:
-            UsageError: there is no reference of that name.
-        """
-        references = get_args(RateReference)
-        if reference not in references:
-            raise UsageError("rate_reference", not_one_of(reference, references))
-        return replace(self, reference=cast(RateReference, reference))
 
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
