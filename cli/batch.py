@@ -22,13 +22,14 @@ from .words import Answer, Option, Words
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite", "models", "skip")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
 
+BATCH = Option(
+    "batch",
+    flag("FILE.toml", read=Path),
+    "Scenes and their settings from a file, and a folder for all as --output; what it does not say is as given here.",
+    None,
+)
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
-    Option(
-        "batch",
-        flag("FILE.toml", read=Path),
-        "Scenes and their settings from a file; --output is then a folder for all of them.",
-        None,
-    ),
+    BATCH,
     Option("resume", None, "With --batch: leave out scenes whose output is there.", False),
     Option(
         "scheduler",

@@ -13,7 +13,7 @@ from aaplug.options.base import REPORT, Options, flag, names, number
 from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
-from .batch import SEVERAL, batch_of_evaluations, for_each_scene
+from .batch import BATCH, SEVERAL, batch_of_evaluations, for_each_scene
 from .console import TERMINAL, say, table
 from .inputs import (
     SCENE_AND_CAMERAS,
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted(HERE.glob("../examples/guides/*.md"))}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
-
-
 WRITTEN = (
     "File to write: .ply; .compressed.ply, .sog, .spz, .glb, .gltf, .usda, .usdc, .usdz or .splat, which keep less "
     "(see `aaplug guide formats`)"
@@ -147,37 +145,22 @@ def finetune(words: Words) -> Answer:
     return Answer(tuned.as_json(), tables(tuned.report))
 
 
-MORE_SCENES = Option(
-    "more",
-    flag("[SCENE ...]", read=Path, by_place=True, count=None),
-    "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
-    (),
-)
-BATCH = Option(
-    "batch",
-    flag("FILE.toml", read=Path),
-    "Scenes and their settings from a file; what it does not say is as on the command line.",
-    None,
-)
-
-
-MODELS = Option(
-    "models",
-    flag("FOLDER", read=Path),
-    "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
-    None,
-)
-SKIP = Option(
-    "skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False
-)
-
-
 @verb(
     SceneOptions,
-    MORE_SCENES,
+    Option(
+        "more",
+        flag("[SCENE ...]", read=Path, by_place=True, count=None),
+        "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
+        (),
+    ),
     BATCH,
-    MODELS,
-    SKIP,
+    Option(
+        "models",
+        flag("FOLDER", read=Path),
+        "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
+        None,
+    ),
+    Option("skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False),
     CameraOptions,
     Orbit,
     output("FOLDER", "Folder for results.json, per_view.json and results.csv.", None),
@@ -251,10 +234,8 @@ def compare(words: Words) -> Answer:
 
     To measure recipes on one scene, use evaluate.
     """
-    first, others = words.reference, [path for path in words.scenes if path != words.reference]
-    paths = others if first is None else [first, *others]
-    if words.reference is None:
-        paths = list(words.scenes)
+    first = words.reference
+    paths = [*words.scenes] if first is None else [first, *(path for path in words.scenes if path != first)]
     if len(paths) < 2:
         raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
     from aaplug.verbs.compare import check_compared
@@ -371,7 +352,7 @@ def view(words: Words) -> Answer:
     scene = cameras = None
     if words.scene is not None or words.model_path is not None:
         scene, cameras = read_inputs(words)
-    command = [word for options in (SceneOptions, CameraOptions, Orbit) for word in words.given(options)]
+    command = [word for options in SCENE_AND_CAMERAS for word in words.given(options)]
     command += [] if words.background == "auto" else ["--background", words.background]
     from aaplug.verbs.view import attend, serving
 
@@ -526,8 +507,7 @@ def recipes(words: Words) -> Answer:
     ]
     headings = ("--recipe", "cost", "when to use it", "what it is, and whose")
     rows = [[(f["name"], f["cost"], f["when"], f["source"]) for f in facts if f["comparison"] == of] for of in (0, 1)]
-    tables = [table(some, headings) for some in rows]
-    return Answer(facts, [tables[0], "For comparison:", tables[1]])
+    return Answer(facts, [table(rows[0], headings), "For comparison:", table(rows[1], headings)])
 
 
 @verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))

@@ -173,9 +173,8 @@ def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
     depth = median_depth(job.scene.gaussians().means, view)
     if name == "dolly":
         return camera_paths.frames(partial(camera_paths.dolly, view, **ends, depth=depth), count)
-    return camera_paths.frames(
-        partial(camera_paths.orbit, view, depth=depth, up=camera_paths.up_of(job.cameras)), count
-    )
+    up = camera_paths.up_of(job.cameras)
+    return camera_paths.frames(partial(camera_paths.orbit, view, depth=depth, up=up), count)
 
 
 def side_by_side(
