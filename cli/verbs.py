@@ -467,7 +467,7 @@ def bench(words: Words) -> Answer:
 
 FIGURES: dict[str, Callable[["Figures"], str]] = {
     "forward": lambda run: f"{run.forward_ms:.0f}",
-    "+ back": lambda run: "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
+    "+ back": lambda run: f"{run.forward_backward_ms:.0f}",
     "exp/eval": lambda run: f"{run.exponentials:.2f}",
     "calls": lambda run: f"{sum(run.calls.values()):,}",
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",

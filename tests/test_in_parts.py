@@ -100,8 +100,6 @@ def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras
     under = middle[bounds.seen] < NYQUIST_VARIANCE**0.5 / bounds.highest[bounds.seen]
     assert (found.count, found.seen, found.under) == (150, bounds.seen.sum(), under.sum())
     assert torch.equal(found.low, scene.means.amin(0))
-    assert found.opacities.quantile(0.5) == pytest.approx(scene.opacities.median().item(), abs=1e-3)
-    assert found.scales.quantile(0.5) == pytest.approx(middle.log().median().item(), abs=0.02)
     assert found.rates.quantile(0.5) == pytest.approx(bounds.highest[bounds.seen].log().median().item(), abs=0.02)
 
 

@@ -52,14 +52,13 @@ class Coverage:
     above_nyquist: Mapping[tuple[str, float], float | None] = field(default_factory=dict)
 
 
-def middle_log_scales(scene: Gaussians) -> Float[Tensor, " n"]:
-    """ln of the standard deviation along the middle axis; for a disc, the smaller of its two."""
-    return scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).median(dim=1).values
-
-
 def log_multiples(scene: Gaussians, bounds: SamplingBounds) -> Float[Tensor, " seen"]:
-    """ln of extent over bound at the highest training rate, of the Gaussians that any training camera sees."""
-    extents = middle_log_scales(scene)[bounds.seen].double() + bounds.highest[bounds.seen].log()
+    """ln of extent over bound at the highest training rate, of the Gaussians that any training camera sees.
+
+    The extent is that along the middle axis; of a disc, the smaller of its two.
+    """
+    middle = scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).median(dim=1).values
+    extents = middle[bounds.seen].double() + bounds.highest[bounds.seen].log()
     return extents - 0.5 * math.log(NYQUIST_VARIANCE)
 
 

@@ -96,13 +96,7 @@ class Journal:
                 return
             first, now = lines[0], self._request
             before = first.get("request") if isinstance(first, dict) else None
-            before = before if isinstance(before, dict) else {}
-            changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
-            if changed:
-                problem = f"is of another request ({listing(list(changed))} changed since)"
-                raise UsageError(
-                    str(path), f"{problem}; repeat that request, or start again with `overwrite`, not `resume`"
-                )
+            check_request(path, before if isinstance(before, dict) else {}, now)
             for number, line in enumerate(lines[1:], start=2):
                 try:
                     view, measurements = line["view"], tuple(map(_measurement, line["measurements"]))
@@ -113,6 +107,13 @@ class Journal:
                 self.views[view] = measurements
             stack.pop_all()  # the stream stays open
             self._stream = stream
+
+
+def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to continue what was asked for otherwise; path: where that is written."""
+    if changed := dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key)):
+        how = "repeat that request, or start again with `overwrite`, not `resume`"
+        raise UsageError(str(path), f"is of another request ({listing(list(changed))} changed since); {how}")
 
 
 def _measurement(line: Any) -> Measurement:

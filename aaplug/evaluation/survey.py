@@ -11,7 +11,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import check_frame, sampling_bounds
-from aaplug.evaluation.coverage import log_multiples, middle_log_scales
+from aaplug.evaluation.coverage import log_multiples
 from aaplug.io.scenes.scene import Scene, probes
 from aaplug.system.monitor import Tell
 
@@ -48,7 +48,7 @@ class Histogram:
 
 @dataclass(eq=False)
 class Survey:
-    """Counts over a scene.  Opacities lie in [0, 1]; scales, rates and multiples are natural logarithms.
+    """Counts over a scene.  Rates and multiples are natural logarithms.
 
     seen, under: Gaussians that a camera sees, and those of them below their sampling bound.
     needles: Gaussians more than `NEEDLE_RATIO` times as long as broad.
@@ -66,8 +66,6 @@ class Survey:
     activated: int = 0
     low: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), torch.inf))
     high: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), -torch.inf))
-    opacities: Histogram = field(default_factory=lambda: Histogram(0.0, 1.0))
-    scales: Histogram = field(default_factory=lambda: Histogram(-35.0, 35.0))
     rates: Histogram = field(default_factory=lambda: Histogram(-35.0, 35.0))
     multiples: Histogram = field(default_factory=lambda: Histogram(-20.0, 20.0))
     largest: float = -math.inf
@@ -82,8 +80,6 @@ class Survey:
         self.count += len(part)
         low, high = part.means.aminmax(dim=0)
         self.low, self.high = torch.minimum(self.low, low), torch.maximum(self.high, high)
-        self.opacities.add(part.opacities)
-        self.scales.add(middle_log_scales(part))
         self.largest = max(self.largest, part.log_scales.max().item())
         _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
         self.needles += int((long - broad > math.log(NEEDLE_RATIO)).sum())

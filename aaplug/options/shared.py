@@ -132,6 +132,11 @@ class RecipeOptions(ViewOptions):
     scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT"), DRAWING] = None
     """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""
 
+    @property
+    def choices(self) -> dict[str, str]:
+        """What decides on images, as results tell it."""
+        return {"quality": self.quality, "rate_reference": self.rate_reference or "pose", "order": self.order}
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageOptions(Options):

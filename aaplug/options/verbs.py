@@ -369,5 +369,3 @@ class BenchOptions(Options):
     """Runs per median."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
-    forward_only: bool = False
-    """Leave out the backward pass."""

@@ -48,7 +48,7 @@ class Figures:
     """Measurements of one scene at one size.
 
     gaussians: those of the scene, or of the levels of detail that the view draws.
-    evaluations: splat-pixel evaluations of compositing.  tile_evaluations: those of whole tiles that ellipses touch.
+    evaluations: splat-pixel evaluations of compositing.
     peak_bytes: the most memory that the process has used so far.
     calls: of torch's operators and of compiled kernels in a frame, each of which costs microseconds beside its work.
     exponential_ns: of one float32 exponential by torch, with the same threads.
@@ -59,9 +59,8 @@ class Figures:
     width: int
     height: int
     forward_ms: float
-    forward_backward_ms: float | None
+    forward_backward_ms: float
     evaluations: int
-    tile_evaluations: int
     ns_per_evaluation: float
     stages_ms: dict[str, float]
     peak_bytes: int
@@ -89,15 +88,15 @@ class _Calls(TorchDispatchMode):
 
 
 @on_free_cores()
-def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
+def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5) -> Figures:
     """Time one view, of the levels of detail that the renderer picks for it if it has any.
 
-    kernels: run the stages, eagerly or compiled.  backward: also time the gradients of all parameters.
+    kernels: run the stages, eagerly or compiled.
     """
     renderer = replace(renderer, rasterizer=Tiled(kernels))
     runs: list[tuple[int, bool]] = []  # of kernels: evaluations, and whether compiled
     with torch.no_grad():
-        stages, gaussians, tile_evaluations = _stages(renderer, camera, kernels, repeats)
+        stages, gaussians = _stages(renderer, camera, kernels, repeats)
         counting = CountingKernels(kernels, lambda *run: runs.append(run))
         with _Calls() as operators:
             replace(renderer, rasterizer=Tiled(counting))(camera)
@@ -109,7 +108,7 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
 
         frame, yardstick = _timed(repeats, lambda: renderer(camera), exponentials)
     evaluations = sum(count for count, _ in runs)
-    gradients = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
+    [gradients] = _timed(repeats, lambda: gradient_step(renderer, camera))
     return Figures(
         rasterizer=kernels.name,
         gaussians=gaussians,
@@ -118,7 +117,6 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         forward_ms=frame,
         forward_backward_ms=gradients,
         evaluations=evaluations,
-        tile_evaluations=tile_evaluations,
         ns_per_evaluation=stages["composite"] * 1e6 / max(1, evaluations),
         stages_ms=stages,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
@@ -200,8 +198,8 @@ def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Floa
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
 
 
-def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) -> tuple[dict[str, float], int, int]:
-    """Times of a frame's stages, as `Renderer.draw` and `Tiled` run them; its Gaussians; evaluations of whole tiles."""
+def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) -> tuple[dict[str, float], int]:
+    """Times of a frame's stages, as `Renderer.draw` and `Tiled` run them, and its number of Gaussians."""
     times: dict[str, float] = {}
 
     def stage(name: str, work: Callable[[], Any]) -> Any:
@@ -226,7 +224,7 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
     bins = stage("bin", lambda: list(bands(splats, grid, kernels)))
     rows = stage("forms", lambda: recipe.pixel.raster_rows(splats, kernels))
     stage("composite", lambda: [composite(rows, band, how) for band in bins])
-    return times, len(chunk), sum(int(band.counts.sum()) for band in bins) * TILE**2
+    return times, len(chunk)
 
 
 def _timed(repeats: int, *works: Callable[[], Any]) -> list[float]:

@@ -55,7 +55,7 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
             work = [(renderer, view.resized(*size_of(text))) for text in options.resolution or ()] or [(renderer, view)]
         kernels = _kernels(options.rasterizer, options.monitor)
         for (renderer, camera), each in product(work, kernels):
-            run = measure(renderer, camera, each, options.repeats, not options.forward_only)
+            run = measure(renderer, camera, each, options.repeats)
             shape = f"{counted(run.gaussians, 'Gaussian')}, {run.width}x{run.height}"
             options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)

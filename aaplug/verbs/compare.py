@@ -81,12 +81,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             "reference": rows[0].name,
             "viewer": viewer and viewer.name,
             "scenes_sha256": {row.name: row.digest for row in rows},
-            "options": {
-                "quality": options.quality,
-                "rate_reference": options.rate_reference or "pose",
-                "order": options.order,
-                "shown": options.show,
-            },
+            "options": options.choices | {"shown": options.show},
         }
         if folder and options.overwrite:
             remove_run(folder)

@@ -65,8 +65,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
         job.announce(task.renderers, task.sized_views, cost=task.cost)
         job.say_assumed(look)
-        choices = {"quality": options.quality, "rate_reference": options.rate_reference or "pose"}
-        choices |= {"order": options.order, "shown": options.show if options.report else None, "layout": options.layout}
+        choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
         facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": choices}
         apply = workers.cluster.map if workers.cluster else map
         if folder and options.overwrite:

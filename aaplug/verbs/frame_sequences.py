@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, replacing
 from aaplug.io.video import CODECS
-from aaplug.system.errors import FormatError, OutputError, UsageError, counted, listing
+from aaplug.system.errors import FormatError, OutputError, counted, listing
 from aaplug.verbs.views import SUFFIXES, names_image
 
 PLACES = re.compile("#+")  # of a frame's number in a name
@@ -94,12 +95,7 @@ class FrameSequence:
                 before = dict(json.loads(self.record.read_bytes()))
             except (OSError, ValueError, TypeError) as error:
                 raise FormatError(self.record, "is damaged; start again with `overwrite`") from error
-            changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-            if changed:
-                problem = f"is of another request ({listing(changed)} changed since)"
-                raise UsageError(
-                    str(self.record), f"{problem}; repeat that request, or start again with `overwrite`, not `resume`"
-                )
+            check_request(self.record, before, now)
             return [place for place, path in enumerate(self.paths) if not path.exists()]
         for path in self.paths:
             if path.exists():

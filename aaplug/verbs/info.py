@@ -68,7 +68,6 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
 
 
 def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> dict[str, Any]:
-    scale = statistics.scales.quantile(0.5)
     return {
         "file": scene.name,
         "format": scene.format,
@@ -89,8 +88,6 @@ def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> d
         "low_corner": statistics.low.tolist() if statistics.count else None,
         "high_corner": statistics.high.tolist() if statistics.count else None,
         "needle_share": statistics.needles / max(1, statistics.count),
-        "median_opacity": statistics.opacities.quantile(0.5),
-        "median_scale": None if scale is None else math.exp(scale),
     }
 
 

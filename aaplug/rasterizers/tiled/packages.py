@@ -34,14 +34,6 @@ class Package:
         shapes = [arg.shape if size is None else arg.shape[1:] for arg, size in example]
         return Package(run, [arg.dtype for arg, _ in example], shapes, kernel.sizes)
 
-    def run_whole(self, *args: Tensor) -> list[Tensor]:
-        """Run contiguous arguments."""
-        return self.run([*args])
-
-    def run_any(self, *args: Tensor) -> list[Tensor]:
-        """Run arguments, copying those that are not contiguous."""
-        return self.run([arg.contiguous() for arg in args])
-
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """True if it can run these arguments; a leading size of one is a separate case to the compiler."""
         for arg, dtype, expected, size in zip(args, self.types, self.shapes, self.sizes, strict=True):
@@ -84,9 +76,9 @@ class CompiledKernels(Kernels):
             return kernel.function
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
             if all(arg.is_contiguous() for arg in args):
-                return package.run_whole
+                return lambda *args: package.run([*args])
             assert all(args[i].is_contiguous() for i in kernel.updates), f"{kernel.name} would update copies"
-            return package.run_any
+            return lambda *args: package.run([arg.contiguous() for arg in args])
         gradient = self._gradients.get(kernel.name + BACKWARD)
         backward = None if gradient is None else self._package(gradient)
         return kernel.function if backward is None else partial(_Tracked.apply, package, backward)
