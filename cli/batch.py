@@ -5,7 +5,6 @@ A batch file's settings are read as the options of their names, so that both mea
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -111,7 +110,7 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str]) -> Answer:
     options = RecipeOptions(scheduler=words.scheduler, threads=words.threads, monitor=TERMINAL)
     with running(options, folder, check, [words.batch], folder=True) as workers:
         apply = map if workers.cluster is None else workers.cluster.map
-        results = apply(_OneScene(None if workers.cluster is None else Path.cwd()), todo.values())
+        results = apply(partial(_one_scene, None if workers.cluster is None else Path.cwd()), todo.values())
         for name, facts in zip(todo, results, strict=True):
             done[name] = {"status": "failed", "error": facts} if isinstance(facts, str) else {"status": "done", **facts}
             TERMINAL.say(": ".join([name, done[name]["status"], *([facts] if isinstance(facts, str) else [])]))
@@ -122,23 +121,18 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str]) -> Answer:
     return Answer({"scenes": outcomes}, [status_table("output or why there is none", rows)], failed)
 
 
-@dataclass(frozen=True)
-class _OneScene:
-    """Does the verb for one scene: facts of what was made, or why there is nothing.
+def _one_scene(elsewhere: Path | None, scene: Words) -> dict[str, Any] | str:
+    """Do the verb for one scene: facts of what was made, or why there is nothing.
 
     elsewhere: on a worker, with one thread, whose terminal nobody reads: the folder that relative paths start from.
     """
+    from aaplug.verbs.batch import outcome
 
-    elsewhere: Path | None
-
-    def __call__(self, scene: Words) -> dict[str, Any] | str:
-        from aaplug.verbs.batch import outcome
-
-        run = scene.command.errors("scene")(scene.command.run)
-        if self.elsewhere is None:
-            return outcome(lambda: run(scene).facts, TERMINAL)
-        with quiet(), chdir(self.elsewhere):
-            return outcome(lambda: run(scene.where(threads=1)).facts, TERMINAL)
+    run = scene.command.errors("scene")(scene.command.run)
+    if elsewhere is None:
+        return outcome(lambda: run(scene).facts, TERMINAL)
+    with quiet(), chdir(elsewhere):
+        return outcome(lambda: run(scene.where(threads=1)).facts, TERMINAL)
 
 
 def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:

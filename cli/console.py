@@ -1,6 +1,5 @@
 """What the user sees: log and progress on stderr, data on stdout."""
 
-import json
 import logging
 import math
 import sys
@@ -162,8 +161,3 @@ class _Rate:
 
 TERMINAL = Terminal()
 say = TERMINAL.say
-
-
-def print_json(data: Any) -> None:
-    """One object on stdout, strict JSON."""
-    sys.stdout.write(json.dumps(data, indent=1, allow_nan=False) + "\n")

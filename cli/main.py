@@ -5,6 +5,7 @@ Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carri
 
 import errno
 import gc
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -91,7 +92,7 @@ def run(words: Sequence[str]) -> int:
             several = given.values.get("batch") is not None  # then each scene's are checked with its file
             answer = command.run(given if several else given.checked())
         if given.values.get("json"):
-            console.print_json(answer.facts)
+            print(json.dumps(answer.facts, indent=1, allow_nan=False))
         elif answer.shown:
             console.show(answer.shown)
         return FAILED if answer.failed else 0

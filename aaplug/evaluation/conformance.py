@@ -228,17 +228,8 @@ def _mirrored(scene: Gaussians) -> Gaussians:
     return replace(scene, means=(torch.where(local[:, 2:] < 0, -local, local) - POSE[:3, 3]) @ POSE[:3, :3])
 
 
-def _moved(px: float) -> Callable[[Camera], Camera]:
-    return lambda camera: replace(camera, cx=camera.cx + px, cy=camera.cy + px)
-
-
 def _coloured(change: Callable[[Any], Tensor]) -> Callable[[Splats2D], Splats2D]:
     return lambda splats: replace(splats, rgb=change(splats))
-
-
-def _by(depths: Callable[[Splats2D], Tensor]) -> Callable[[Splats2D], Splats2D]:
-    """Splats drawn in the order of these numbers."""
-    return lambda splats: replace(splats, depths=depths(splats).to(splats.depths))
 
 
 GAMMA = 2.2
@@ -262,8 +253,8 @@ FAULTS = (
     Fault("the picture is upside down", image=lambda image: image.flip(0)),
     Fault("the picture is mirrored, left to right", image=lambda image: image.flip(1)),
     Fault("the picture is turned by half a turn", image=lambda image: image.flip(0, 1)),
-    Fault("places are half a pixel too far right and down", camera=_moved(0.5)),
-    Fault("places are half a pixel too far left and up", camera=_moved(-0.5)),
+    Fault("places are half a pixel too far right and down", camera=lambda c: replace(c, cx=c.cx + 0.5, cy=c.cy + 0.5)),
+    Fault("places are half a pixel too far left and up", camera=lambda c: replace(c, cx=c.cx - 0.5, cy=c.cy - 0.5)),
     Fault("harmonics: degree 1 lacks its minus signs", scene=_signs(1, 3)),
     Fault("harmonics: degree 1 is taken in the order x, y, z", scene=_sh(lambda c: torch.cat(
         [-c[:, 1:2], c[:, 2:3], -c[:, :1], c[:, 3:]], dim=1))),
@@ -281,9 +272,9 @@ FAULTS = (
     Fault("near plane: Gaussians nearer than 1 are not drawn", rules=replace(RULES_3DGS, near=1.0)),
     Fault("near plane: Gaussians nearer than 0.01 are drawn", rules=replace(RULES_3DGS, near=1e-3)),
     Fault("near plane: Gaussians behind the camera are drawn", scene=_mirrored),
-    Fault("order: the farthest splat is drawn over the others", splats=_by(lambda splats: -splats.depths)),
-    Fault("order: splats are drawn in the file's order", splats=_by(lambda splats: splats.sources)),
-    Fault("order: splats are drawn against the file's order", splats=_by(lambda splats: -splats.sources)),
+    Fault("order: the farthest splat is drawn over the others", splats=lambda s: replace(s, depths=-s.depths)),
+    Fault("order: splats are drawn in the file's order", splats=lambda s: replace(s, depths=s.sources.double())),
+    Fault("order: splats are drawn against the file's order", splats=lambda s: replace(s, depths=-s.sources.double())),
     Fault("opacity: the stored logit is taken for the opacity", scene=lambda s: replace(
         s, logit_opacities=s.logit_opacities.clamp(1e-6, 1 - 1e-6).logit())),
     Fault("opacity: alpha is capped at 0.9", rules=replace(RULES_3DGS, max_alpha=0.9)),

@@ -95,12 +95,8 @@ def _onnx(path: Path) -> Network:
     return run
 
 
-def _torch(path: Path) -> Network:
-    return torch.export.load(path).module()
-
-
 NETWORKS = {  # by suffix: how one is loaded, and what it is
     ".pb": (_opencv, "a network that OpenCV can read"),
     ".onnx": (_onnx, "an ONNX network that OpenCV can read"),
-    ".pt2": (_torch, "a program of torch.export"),
+    ".pt2": (lambda path: torch.export.load(path).module(), "a program of torch.export"),
 }

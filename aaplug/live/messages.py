@@ -133,6 +133,9 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
     sides = body.get("sides")
     if not isinstance(sides, list) or len(sides) != 2 or not all(isinstance(side, dict) for side in sides):
         raise UsageError("sides", f"takes two objects, got {_short(sides)}")
+    colour = body.get("background")
+    if colour is not None and not (isinstance(colour, str) and re.fullmatch("#[0-9a-f]{6}", colour)):
+        raise UsageError("background", f"takes #rrggbb, got {_short(colour)}")
     left, right = (Side(_name(side, "recipe", recipes), _name(side, "quality", QUALITIES)) for side in sides)
     return PictureRequest(
         id=_whole(body, "id", 0, MAX_ID),
@@ -146,7 +149,7 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
         moving=body.get("moving") is True,
         overlay=None if body.get("paint") is None else _name(body, "paint", OVERLAYS),
         photo=body.get("photo") is True,
-        background=None if body.get("background") is None else _colour(body["background"]),
+        background=None if colour is None else colour_of(colour),
     )
 
 
@@ -161,12 +164,6 @@ def _pose(body: Mapping[str, Any]) -> tuple[float, ...]:
     except UsageError as error:
         raise UsageError("pose", "takes a rotation and a translation, row by row") from error
     return numbers
-
-
-def _colour(value: object) -> Colour:
-    if not isinstance(value, str) or not re.fullmatch("#[0-9a-f]{6}", value):
-        raise UsageError("background", f"takes #rrggbb, got {_short(value)}")
-    return colour_of(value)
 
 
 def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> float:

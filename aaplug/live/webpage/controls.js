@@ -42,7 +42,6 @@ function hello(facts) {
   asked = "";
   if (same) return wake();
   Object.assign(state, {scene: `${facts.title}, ${facts.gaussians}`, background: null, paint: null});
-  at("scales").replaceChildren();
   document.title = `${facts.title} · aaplug`;
   at("title").textContent = facts.title;
   const kernels = facts.rasterizer === "compiled" ? "" : `, rasterizer ${facts.rasterizer}: \`aaplug warmup\` makes it faster`;
@@ -54,13 +53,7 @@ function hello(facts) {
   listed("paint", ["", ...Object.keys(facts.paints)], ["nothing", ...Object.values(facts.paints)]);
   listed("view", ["", ...facts.views.keys()], ["–", ...facts.views.map(({name}) => name)]);
   at("cameras").textContent = facts.assumed ? "Views" : "Cameras";
-  for (const scale of EIGHTHS) {
-    const label = document.createElement("label"), input = document.createElement("input"), text = document.createElement("span");
-    Object.assign(input, {type: "radio", name: "size", value: scale});
-    text.textContent = scaleName(scale);
-    label.append(input, text);
-    at("scales").append(label);
-  }
+  toggles("scales", "radio", "size", EIGHTHS, scaleName);
   state.sides = facts.sides;
   home();
   if (first) fromAddress();

@@ -1,6 +1,5 @@
 // What is seen is one state, which gestures and controls change; `frame` asks the server for it, and `draw` shows it.
 
-const at = (id) => document.getElementById(id);
 const stage = at("stage"), canvas = at("picture");
 const REST_MS = 80; // ms without a change after which the camera is at rest
 const FPS = 24; // of a recorded path

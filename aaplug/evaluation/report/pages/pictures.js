@@ -1,10 +1,21 @@
-// Pictures: decoded images and maps of their errors, how many fit into a box, and drawing them.
+// Pictures: decoded images and maps of their errors, how many fit into a box, and drawing them; and rows of choices.
 
 const ERROR_FULL = 32; // levels of 255 at the end of the error scale
 const HEAT_STOPS = [[0, 0, 4], [86, 16, 110], [187, 55, 84], [249, 140, 10], [252, 255, 164]];
 const GAP = 10, LABEL = 26; // CSS px between tiles, and of a label's line
 
+const at = (id) => document.getElementById(id);
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+function toggles(parent, type, name, values, text = String) { // a row of radio buttons or check boxes
+  at(parent).replaceChildren(...values.map((value) => {
+    const label = document.createElement("label"), input = document.createElement("input"), words = document.createElement("span");
+    Object.assign(input, {type, name, value});
+    words.textContent = text(value);
+    label.append(input, words);
+    return label;
+  }));
+}
 
 function heat(level) { // colour of an error in levels of 255
   const t = Math.min(1, level / ERROR_FULL) * (HEAT_STOPS.length - 1), i = Math.min(HEAT_STOPS.length - 2, Math.floor(t));

@@ -1,6 +1,5 @@
 // The viewer: what is shown is one state, which the controls and the address change and `render` draws.
 
-const at = (id) => document.getElementById(id);
 const gallery = JSON.parse(at("gallery").textContent);
 const stage = at("stage"), crops = at("crops"), figure = at("compare");
 const BESIDE = 720, BETWEEN = 24; // CSS px: from this width on the crops stand right of the picture, so far away
@@ -118,16 +117,8 @@ function controls(chosen) { // show the state
   at("error-scale").hidden = !state.error || !has(gallery.truth);
 }
 
-function toggles(parent, type, name, values) { // a row of radio buttons or check boxes
-  for (const value of values) {
-    const label = document.createElement("label"), input = document.createElement("input"), text = document.createElement("span");
-    Object.assign(input, {type, name, value});
-    text.textContent = name === "role" ? nameOf(value) : value;
-    label.append(input, text); at(parent).append(label);
-  }
-}
 toggles("scales", "radio", "scale", gallery.scales);
-toggles("roles", "checkbox", "role", order.filter((role) => gallery.shots.some(({images}) => role in images)));
+toggles("roles", "checkbox", "role", order.filter((role) => gallery.shots.some(({images}) => role in images)), nameOf);
 at("view").append(...gallery.views.map((view) => new Option(view, view)));
 
 at("controls").addEventListener("change", ({target}) => {
