@@ -91,8 +91,7 @@ def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
 
     models: folder of the trained scenes; None if they lie with the data.
 
-    Raises:
-        UsageError: the protocol is not one of a data set.
+    Raises UsageError if the protocol is not one of a data set.
     """
     data_set, root = data_set_of(protocol), models or data
     scenes, missing = dict[str, tuple[Path, Path]](), dict[str, str]()

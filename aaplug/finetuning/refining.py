@@ -69,8 +69,7 @@ def refine(
     smaller: sizes of images, against those at `rate`, that should be right too; steps take all sizes equally often.
     beside: Gaussians that are drawn with the level and stay as they are.
 
-    Raises:
-        UsageError: no step has a finite gradient.
+    Raises UsageError if no step has a finite gradient.
     """
     steps = round(steps * min(MAX_STEPS_FACTOR, max(1.0, USUAL_STEPS_RATE / rate)))
     scales = (rate, *(rate * size for size in smaller))

@@ -102,8 +102,7 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
 
-    Raises:
-        UsageError: it is none of ours.
+    Raises UsageError if it is none of ours.
     """
     if not isinstance(text, str):
         raise UsageError("message", "takes text, got bytes")

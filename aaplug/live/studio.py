@@ -94,11 +94,7 @@ class Studio:
             page.orders.clear()
 
     def receive(self, page: Page, said: PictureRequest | Order | Receipt) -> None:
-        """Take a message of a page.
-
-        Raises:
-            UsageError: it wants more than it may.
-        """
+        """Take a message of a page; raises UsageError if it wants more than it may."""
         with self._changed:
             match said:
                 case PictureRequest():

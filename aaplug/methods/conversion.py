@@ -45,8 +45,7 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
 
     training: may be None if the scene stores a 3D filter.
 
-    Raises:
-        UsageError: something is fused already, the scene needs nothing, or cameras are missing.
+    Raises UsageError if something is fused already, the scene needs nothing, or cameras are missing.
     """
     if not (scene.flat and isinstance(form.filter, Smoothing3D)):
         _check_discs(scene)
@@ -67,8 +66,7 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
 
     If the viewer draws as training did, only a stored 3D filter is fused.
 
-    Raises:
-        UsageError: the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
+    Raises UsageError if the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
     """
     if viewer.convention is None:
         return fuse_stored(scene)

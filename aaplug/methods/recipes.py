@@ -52,8 +52,7 @@ def find_recipe(
 def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
     """The recipe as it applies to a scene: `auto` draws discs for a scene of 2D Gaussians.
 
-    Raises:
-        UsageError: the scene lacks what the recipe needs.
+    Raises UsageError if the scene lacks what the recipe needs.
     """
     missing = recipe.lacks(scene)
     if missing is not None:

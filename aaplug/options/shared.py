@@ -61,8 +61,7 @@ def size_of(text: str, where: str = "resolution", shape: tuple[int, int] | None 
 
     where: the option that it is of.  shape: width and height whose aspect -1 on one side keeps.
 
-    Raises:
-        UsageError: it is no size, or a side is above `MAX_SIDE`.
+    Raises UsageError if it is no size, or a side is above `MAX_SIDE`.
     """
     free = r"|-1" if shape else ""
     match = re.fullmatch(rf"([1-9]\d{{0,8}}{free})x([1-9]\d{{0,8}}{free})", text, re.ASCII)

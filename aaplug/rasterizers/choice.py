@@ -31,8 +31,7 @@ def find_rasterizer(
     frames: None if nobody knows: "auto" then builds what is missing while it draws.
     say: called with the choice, in words.  gradients: each frame is a step of an optimization.
 
-    Raises:
-        UsageError: the name is not known, or "compiled" was asked for and cannot be built.
+    Raises UsageError if the name is not known, or "compiled" was asked for and cannot be built.
     """
     if name in RASTERIZERS:
         return RASTERIZERS[name]

@@ -209,8 +209,7 @@ class Job(Generic[O_co]):
         cost: where it is not that of these images.  work: in words, if it is more than these images.
         processes: number that share it.  fewer: what takes less time, in words.
 
-        Raises:
-            UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
+        Raises UsageError if it would take more memory than the limit MEMORY_SHARE of the machine's allows.
         """
         cost = cost or cost_of(renderers, views)
         needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER_SECONDS else 1)

@@ -133,8 +133,7 @@ def by_order(
 
     samples: along a pixel's side.  draw: composites by `Order`, which shows these statistics.
 
-    Raises:
-        UsageError: the view has more splats than float32 has whole numbers.
+    Raises UsageError if the view has more splats than float32 has whole numbers.
     """
     shown = [statistic for name, needed in STATISTICS.items() if name in names for statistic in needed]
     if not shown:

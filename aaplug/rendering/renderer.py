@@ -497,11 +497,7 @@ def own_look(
 
 @contract
 def background_colour(background: Background, cameras: object = None) -> Colour:
-    """The colour behind the scene.
-
-    Raises:
-        UsageError: CSS knows no such colour.
-    """
+    """The colour behind the scene; raises UsageError if CSS knows no such colour."""
     if background == "auto":
         return (cameras.background if isinstance(cameras, CameraSet) else None) or BLACK
     red, green, blue = colour_of(background) if isinstance(background, str) else background

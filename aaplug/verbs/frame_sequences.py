@@ -33,8 +33,7 @@ class FrameSequence:
     def of(cls, output: Path, format: str | None) -> "FrameSequence | None":
         """The sequence that an output names, or that a format asks for in a folder; else None.
 
-        Raises:
-            OutputError: the name has places for more than one number, or is that of no format.
+        Raises OutputError if the name has places for more than one number, or is that of no format.
         """
         if not PLACES.search(output.name):
             is_file = names_image(output) or output.suffix.lower() in CODECS

@@ -255,8 +255,7 @@ class _Maker:
 def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
     """The goals of merging, one scene after the other.
 
-    Raises:
-        UsageError: the scene has fewer Gaussians than asked for.
+    Raises UsageError if the scene has fewer Gaussians than asked for.
     """
     if not options.single:
         levels = range(1, (options.levels or DEFAULT_LEVELS) + 1)

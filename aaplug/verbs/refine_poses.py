@@ -45,8 +45,7 @@ def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOpt
 def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> Refined:
     """A job's cameras, with the poses of some views refined, and a note that says by how much.
 
-    Raises:
-        UsageError: a view has no photograph.
+    Raises UsageError if a view has no photograph.
     """
     source_of(views, "photographs")
     renderer, poses = look.by(find_recipe("auto", quality="fast")), []

@@ -159,8 +159,7 @@ def _request(
 def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
     """The cameras of a zoom, a dolly or an orbit.
 
-    Raises:
-        UsageError: it has more than `MAX_FRAMES`, or the view is not known.
+    Raises UsageError if it has more than `MAX_FRAMES`, or the view is not known.
     """
     options = job.options
     count = max(1, round(options.seconds * fps))

@@ -31,8 +31,7 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
     unsized: pixels stay square where a resolution changes the aspect, as they do through a lens that shows its angle
         along the shorter side.
 
-    Raises:
-        UsageError: an image would be larger than `MAX_SIDE`.
+    Raises UsageError if an image would be larger than `MAX_SIDE`.
     """
     options = job.options
     bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
@@ -97,8 +96,7 @@ def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) ->
 def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
     """How images are stored, and the options; those for images with alpha have no background.
 
-    Raises:
-        UsageError: the format does not hold what is asked for, or there is to be a background and alpha.
+    Raises UsageError if the format does not hold what is asked for, or there is to be a background and alpha.
     """
     passes = [options.passes] if isinstance(options.passes, str) else options.passes
     stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)

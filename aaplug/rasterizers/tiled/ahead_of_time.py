@@ -243,8 +243,7 @@ def build(
     progress: told the percentage of the time for all that has been spent.
     recipes, gradients: see `kernels_of`.  names: of the kernels to build, instead.
 
-    Raises:
-        UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
+    Raises UsageError if there is no compiler or it fails, the cache folder cannot be written, or a process died.
     """
     kernels = kernels_of(recipes, gradients)
     if names is not None:
@@ -261,8 +260,7 @@ def build_bundle(
 ) -> list[tuple[Kernel, Target]]:
     """Build what is missing of a bundle: all kernels, trainers' too, for each of `targets`.
 
-    Raises:
-        UsageError: as `build`; also, this machine has none of the instruction sets.
+    Raises UsageError as `build`; also, this machine has none of the instruction sets.
     """
     if not targets():
         names = " or ".join(target.name for target in TARGETS)
@@ -336,8 +334,7 @@ def _is_sound(kernel: Kernel, package: Path) -> bool:
 def _compared(kernel: Kernel, package: Path) -> Run:
     """The function in a kernel's library, whose results were compared with the eager ones once.
 
-    Raises:
-        UsageError: it is not built, cannot be unpacked or loaded, or has other results.
+    Raises UsageError if it is not built, cannot be unpacked or loaded, or has other results.
     """
     library, mark = (cache_folder() / (package.stem + suffix) for suffix in (".so", ".so.sha256"))
     try:
@@ -413,11 +410,7 @@ def _build(
 
 
 def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
-    """Inductor's settings.
-
-    Raises:
-        UsageError: this torch or the compiler takes no target.
-    """
+    """Inductor's settings; raises UsageError if this torch or the compiler takes no target."""
     from torch._inductor.config import cpp  # takes long
 
     configs = OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED_OPTIONS if kernel.chained else {})
