@@ -52,10 +52,8 @@ def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
         data, protocol = path_of(words), str(words.protocol)
         found = find_scenes(protocol, data, words.models)
         check_whole(protocol, data, found, words.skip)
-        each = {"more": (), "model_path": None, "models": None}
-        scenes = [
-            (n, words.where(scene=model, cameras=cameras, **each)) for n, (model, cameras) in found.scenes.items()
-        ]
+        words = words.where(more=(), model_path=None, models=None)
+        scenes = [(n, words.where(scene=model, cameras=data)) for n, (model, data) in found.scenes.items()]
     else:
         paths = [path_of(words), *words.more]
         names = [path.stem if path.is_file() else path.name for path in paths]

@@ -484,10 +484,9 @@ def viewers(words: Words) -> Answer:
     from aaplug.methods.viewers import VIEWERS
 
     headings = ("--for", "adds; where a splat ends", "program, what to choose there, and how the rule is known")
-    rows = [
-        (v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()
-    ]
-    return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
+    all_of = VIEWERS.values()
+    rows = [(v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in all_of]
+    return Answer([asdict(viewer) for viewer in all_of], [table(rows, headings)])
 
 
 @verb(json_of("the table as a list of objects"))

@@ -40,9 +40,8 @@ class Option(NamedTuple):
         if self.argument is not None and self.argument.by_place:
             return []
         name = ("--no-" if self.default is True else "--") + self.name.replace("_", "-")
-        return sorted(
-            [name, *(self.argument.flags if self.argument else ())], key=lambda one: (one[1] != "-", one == name)
-        )
+        others = self.argument.flags if self.argument else ()
+        return sorted([name, *others], key=lambda one: (one[1] != "-", one == name))
 
     @property
     def shown(self) -> str:

@@ -20,7 +20,7 @@ from PIL import Image
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.verbs.video import PATHS
+from aaplug.options.verbs import BUILT_IN_PATHS
 from tests.conftest import SAMPLE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -206,7 +206,7 @@ def test_documented_commands_run(block, here, capsys):
         assert program == "aaplug", f"{line}: run this too, or say in ELSEWHERE who does"
         shorter = FITTING if verb == "convert" and "--for" in words else SHORTER.get(verb, [])
         shorter = ONE_WORKER if "local" in words else shorter
-        if verb == "video" and "--path" in words and words[words.index("--path") + 1] not in PATHS:
+        if verb == "video" and "--path" in words and words[words.index("--path") + 1] not in BUILT_IN_PATHS:
             shorter = []  # a file says itself how long it is
         with pytest.raises(SystemExit) as stop:
             main([verb, *words, *shorter])

@@ -183,9 +183,8 @@ def draw(scene: Gaussians, viewer: Viewer, fault: Fault = NONE, white: bool = Fa
     camera, rule = fault.camera(CAMERA), fault.rule(viewer.convention)
     splats = project(scene, camera, rules=fault.rules).blurred(rule.kernel, rule.compensated)
     splats = fault.splats(shade(splats, scene, camera))
-    return fault.image(
-        REFERENCE(splats, camera.hw, WHITE if white else BLACK, fault.pixel, rules=fault.rules).rgb
-    ).clamp(0, 1)
+    drawn = REFERENCE(splats, camera.hw, WHITE if white else BLACK, fault.pixel, rules=fault.rules)
+    return fault.image(drawn.rgb).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -354,9 +353,8 @@ def judged(pictures: Mapping[str, Picture | str], viewer: Viewer | None = None) 
 
     def explained(viewer: Viewer, fault: Fault) -> tuple[int, float]:
         """Tests that agree, and minus the error of all."""
-        return sum(s.agrees(viewer, fault) for s in seen.values()), -math.fsum(
-            s.error(viewer, fault) for s in seen.values()
-        )
+        errors = [s.error(viewer, fault) for s in seen.values()]
+        return sum(s.agrees(viewer, fault) for s in seen.values()), -math.fsum(errors)
 
     found, cause = max(rules.values(), key=lambda v: explained(v, NONE)), NONE
     if wrong := [each for each in seen.values() if not each.agrees(found)]:

@@ -77,10 +77,8 @@ def _places(data_set: DataSet, root: Path, scene: str) -> Iterator[Path]:
 
 def is_set(protocol: str, folder: Path) -> bool:
     """Whether a folder holds scenes of the protocol's data set."""
-    data_set = DATA_SETS.get(protocol)
-    return data_set is not None and any(
-        place.is_dir() for scene in data_set.scenes for place in _places(data_set, folder, scene)
-    )
+    known = DATA_SETS.get(protocol)
+    return known is not None and any(each.is_dir() for s in known.scenes for each in _places(known, folder, s))
 
 
 def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:

@@ -262,9 +262,8 @@ def cost_cells(report: Report) -> list[tuple[str, list[list[Cell]]]]:
     columns = [("seconds per view, median", time)]
     if any(m.evaluations is not None for m in report.measurements):
         columns.append(("million evaluations per view", evaluations))
-    return [
-        (title, [[cell(report.select(r, s)) for s in report.scales] for r in report.recipes]) for title, cell in columns
-    ]
+    views = [[report.select(recipe, scale) for scale in report.scales] for recipe in report.recipes]
+    return [(title, [[cell(each) for each in row] for row in views]) for title, cell in columns]
 
 
 def results(report: Report) -> dict[str, Any]:

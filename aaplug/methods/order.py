@@ -85,9 +85,8 @@ class Order:
     ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
         """The same by the definition, of all splats at once."""
         assert splats.rgb is not None
-        alpha = (splats.opacities * self.pixel.exact(splats, centres[:, None] - splats.means)).clamp(
-            max=rules.max_alpha
-        )
+        values = self.pixel.exact(splats, centres[:, None] - splats.means)
+        alpha = (splats.opacities * values).clamp(max=rules.max_alpha)
         alpha = torch.where(alpha >= rules.min_alpha, alpha, 0.0)
         behind = (1 - alpha).cumprod(dim=1)
         weight = torch.where(behind >= rules.min_transmittance, alpha * behind / (1 - alpha), 0.0)

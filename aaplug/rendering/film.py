@@ -47,9 +47,8 @@ def filmed(
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
     elif shutter is not None:
         if not path:
-            raise UsageError(
-                "shutter", "is a share of the time between frames of a path; for one view give `camera_to`"
-            )
+            problem = "is a share of the time between frames of a path; for one view give `camera_to`"
+            raise UsageError("shutter", problem)
         motions = _motions([_instant(view) for view in views], shutter)
     if motions and all(_still(*motion) for motion in motions):
         raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
@@ -95,6 +94,5 @@ def _motions(frames: Sequence[Camera], shutter: float) -> list[tuple[Camera, Cam
 
 def _still(first: Camera, last: Camera) -> bool:
     """Whether two cameras see the same."""
-    return first.intrinsics == last.intrinsics and torch.allclose(
-        first.cam_from_world, last.cam_from_world, 1e-9, 1e-12
-    )
+    same = torch.allclose(first.cam_from_world, last.cam_from_world, 1e-9, 1e-12)
+    return same and first.intrinsics == last.intrinsics

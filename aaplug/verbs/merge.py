@@ -72,9 +72,8 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")
                 part = carried(part, training, into)
             if part.extras:
-                options.monitor.say(
-                    f"{scene.title}: the merged scene does not have its columns {', '.join(part.extras)}"
-                )
+                columns = ", ".join(part.extras)
+                options.monitor.say(f"{scene.title}: the merged scene does not have its columns {columns}")
             parts.append(replace(placed(part, turn, scale, move), extras={}, origin=None))
         degree, fused = max(part.sh_degree for part in parts), {str(f): f for part in parts for f in part.fused}
         merged = joined([replace(of_degree(part, degree), fused=tuple(fused.values())) for part in parts])
@@ -102,10 +101,10 @@ def _places(
     for turn in rows("turn", options.turn, TURNS):
         if len(turn) == len("wxyz") and not any(turn):
             raise UsageError("turn", "expected a quaternion, got one of length 0")
-        xyzw = [*turn[1:], turn[0]]
-        rotation = (
-            Rotation.from_euler("xyz", turn, degrees=True) if len(turn) == len("xyz") else Rotation.from_quat(xyzw)
-        )
+        if len(turn) == len("xyz"):
+            rotation = Rotation.from_euler("xyz", turn, degrees=True)
+        else:
+            rotation = Rotation.from_quat([*turn[1:], turn[0]])
         turns.append(torch.from_numpy(rotation.as_matrix()))
     scales = [1.0] * count if options.scale is None else [each for (each,) in rows("scale", options.scale, (1,))]
     return turns, scales, rows("move", options.move, TURNS[:1])

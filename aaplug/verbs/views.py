@@ -43,10 +43,8 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
         sized = [(v.framed if square else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
         stretched = [v for v, by in zip(sized, bent, strict=True) if abs(v.fx / by.fx * by.fy / v.fy - 1) > STRETCH]
         if stretched and "-1" not in options.resolution:
-            size = f"{stretched[0].width}x{stretched[0].height}"
-            job.monitor.say(
-                f"resolution: {size} px stretches view {stretched[0].name}; -1 on one side keeps its aspect"
-            )
+            what = f"{stretched[0].width}x{stretched[0].height} px stretches view {stretched[0].name}"
+            job.monitor.say(f"resolution: {what}; -1 on one side keeps its aspect")
     for view in sized:
         check_side(view.name, view.width, view.height)
     return sized

@@ -147,9 +147,8 @@ def has_gradients_on_screen(screen: ScreenFilter) -> None:
 
 def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) -> Gaussians:
     """A scene that every world filter changes."""
-    return replace(
-        make_scene(N, dtype=dtype), filter_3d=torch.linspace(0.01, 0.2, N, dtype=dtype), convention=convention
-    )
+    filters = torch.linspace(0.01, 0.2, N, dtype=dtype)
+    return replace(make_scene(N, dtype=dtype), filter_3d=filters, convention=convention)
 
 
 @law_of("world filter")

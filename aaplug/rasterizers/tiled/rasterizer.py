@@ -80,9 +80,8 @@ class Tiled:
             columns = pixel.columns + channels - 3
             if rows.shape != (len(splats) + 1, columns):
                 expected = f"{len(splats) + 1} rows (one per splat and a padding row) of {columns} columns"
-                raise UsageError(
-                    f"pixel kernel {pixel.name}", f"raster_rows should return {expected}, got {tuple(rows.shape)}"
-                )
+                problem = f"raster_rows should return {expected}, got {tuple(rows.shape)}"
+                raise UsageError(f"pixel kernel {pixel.name}", problem)
             rays = partial(pixel.rays, splats) if isinstance(pixel, ReadsRays) else None
             paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels, channels, rays))
             gradients = rows.requires_grad and torch.is_grad_enabled()

@@ -119,10 +119,8 @@ def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
     }
     for (view, scale), roles in files.items():
         width, height = image_size(roles[report.recipes[-1]])
-        pictures = {
-            r: {"uri": uris[path], "score": scores.get((names[view], scale, r), "")} for r, path in roles.items()
-        }
-        size = {"width": width, "height": height}
+        at, size = (names[view], scale), {"width": width, "height": height}
+        pictures = {r: {"uri": uris[path], "score": scores.get((*at, r), "")} for r, path in roles.items()}
         shots.append({"view": names[view], "scale": scale_name(scale), **size, "images": pictures})
     return {
         "views": [names[view] for view in images.report_views],
