@@ -145,26 +145,16 @@ def _spark(name: str, convention: Convention, settings: str) -> Viewer:
 
 def _playcanvas(name: str, program: str, switch: str, compensated: bool, evidence: str = MEASURED) -> Viewer:
     rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
-    how = {
-        "sh_degree": 3,
-        "cut": ROOT_8,
-        "fades": True,
-        "levels": "distance or a budget of splats",
-        "formats": ("ply", "compressed.ply", "sog"),
-        "smallest": SMALLEST,
-    }
-    return Viewer(name, program, rule, switch, evidence, switched=compensated, **how)
+    drawn = {"sh_degree": 3, "cut": ROOT_8, "fades": True, "smallest": SMALLEST}
+    files = {"levels": "distance or a budget of splats", "formats": ("ply", "compressed.ply", "sog")}
+    return Viewer(name, program, rule, switch, evidence, switched=compensated, **drawn, **files)
 
 
 def _babylon(name: str, switch: str, compensated: bool) -> Viewer:
     rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
-    how = {
-        "sh_degree": 3,
-        "cut": ROOT_8,
-        "floor": 0.0,
-        "formats": ("ply", "compressed.ply", "sog", "splat", "glb", "gltf"),
-    }
-    return Viewer(name, "Babylon.js 9.35.0", rule, switch, MEASURED, switched=compensated, **how)
+    formats = ("ply", "compressed.ply", "sog", "splat", "glb", "gltf")
+    how = {"switched": compensated, "sh_degree": 3, "cut": ROOT_8, "floor": 0.0, "formats": formats}
+    return Viewer(name, "Babylon.js 9.35.0", rule, switch, MEASURED, **how)
 
 
 def _mkkellogg(name: str, convention: Convention, settings: str) -> Viewer:

@@ -1,7 +1,4 @@
-"""Options of each verb, stated once: a field is a verb's keyword, its docstring the command line's help.
-
-Importing them takes no torch, so that help and mistakes on the command line are answered at once.
-"""
+"""Options of each verb."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -29,12 +29,8 @@ from aaplug.verbs.evaluate import check_journalled
 from aaplug.verbs.verb import ScenesLike, compares
 from aaplug.verbs.views import file_names
 
-PROTOCOL = replace(
-    PROTOCOLS["self"],
-    name="compare",
-    source="the first scene as its recipe draws it at each size",
-    scales=COMPARED_SCALES,
-)
+SOURCE = "the first scene as its recipe draws it at each size"
+PROTOCOL = replace(PROTOCOLS["self"], name="compare", source=SOURCE, scales=COMPARED_SCALES)
 
 
 @compares(CompareOptions)

@@ -57,11 +57,9 @@ class OnDemandKernels(CompiledKernels):
         if self._missing and self._next_look == math.inf:
             self._next_look = time.monotonic() + PATIENCE_SECONDS
             known = self._missing <= {kernel.name for kernel in KERNELS}
+            when = f"after {PATIENCE_SECONDS:.0f} s{', or before it by `aaplug warmup`' * known}"
             log.warning(
-                "kernels run eagerly, several times slower, until they are compiled: beside this program after "
-                "%.0f s%s",
-                PATIENCE_SECONDS,
-                ", or before it by `aaplug warmup`" if known else "",
+                "kernels run eagerly, several times slower, until they are compiled: beside this program %s", when
             )
         return runner
 
