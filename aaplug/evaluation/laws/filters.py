@@ -40,30 +40,25 @@ def _with_scales(scene: Gaussians, *log_scales: float) -> Gaussians:
     return replace(scene, log_scales=scene.log_scales.new_tensor(log_scales).repeat(N, 1))
 
 
-class Situation(NamedTuple):
-    """A view, and the convention that the scene was trained in."""
-
-    view: Camera
-    convention: Convention
-
-    @property
-    def training(self) -> TrainingViews:
-        """The training views of `SCENE`, had it been trained in the convention."""
-        return trained_with(self.convention)
-
-
-SITUATIONS = {
-    "training size, classic": Situation(CAMERAS[0], CLASSIC),
-    "half, antialiased": Situation(CAMERAS[0].scaled(0.5), ANTIALIASED),
-    "threefold, mip": Situation(CAMERAS[0].scaled(3.0), MIP),
-    "free, near and small, classic": Situation(FREE.scaled(0.3), CLASSIC),
-}
-
-
 @cache
 def trained_with(convention: Convention) -> TrainingViews:
     """The training views of `SCENE`, had it been trained in that convention."""
     return TrainingViews.of(replace(SCENE, convention=convention), CAMERAS)
+
+
+class Situation(NamedTuple):
+    """A view, and the training views of `SCENE` in a convention."""
+
+    view: Camera
+    training: TrainingViews
+
+
+SITUATIONS = {
+    "training size, classic": Situation(CAMERAS[0], trained_with(CLASSIC)),
+    "half, antialiased": Situation(CAMERAS[0].scaled(0.5), trained_with(ANTIALIASED)),
+    "threefold, mip": Situation(CAMERAS[0].scaled(3.0), trained_with(MIP)),
+    "free, near and small, classic": Situation(FREE.scaled(0.3), trained_with(CLASSIC)),
+}
 
 
 def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.0)) -> Splats2D:
@@ -82,10 +77,10 @@ def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.
 @law_of("screen filter")
 def keeps_splats(screen: ScreenFilter) -> None:
     """It keeps its input, and returns splats with other covariances and opacities alone."""
-    for view, convention in SITUATIONS.values():
+    for view, training in SITUATIONS.values():
         splats = shade(project(SCENE, view), SCENE, view)
         before = copies_of(splats)
-        filtered = screen(splats, view, trained_with(convention))
+        filtered = screen(splats, view, training)
         require_same(splats, before)
         require(len(filtered) == len(splats), "leaves splats out")
         require_same(filtered, {name: before[name] for name in ("means", "depths", "sources", "rgb")})
@@ -94,9 +89,9 @@ def keeps_splats(screen: ScreenFilter) -> None:
 @law_of("screen filter")
 def never_shrinks_splats(screen: ScreenFilter) -> None:
     """Covariances never shrink, and stored determinants are theirs."""
-    for view, convention in SITUATIONS.values():
+    for view, training in SITUATIONS.values():
         splats = project(SCENE, view)
-        filtered = screen(splats, view, trained_with(convention))
+        filtered = screen(splats, view, training)
         xx, xy, yy = (filtered.covs - splats.covs).unbind(dim=1)
         grows = (xx.min() >= 0) & (yy.min() >= 0) & ((xx * yy - xy * xy).min() >= -1e-12)
         require(grows & (filtered.dets >= splats.dets).all(), "a covariance is smaller than it was")
@@ -107,13 +102,13 @@ def never_shrinks_splats(screen: ScreenFilter) -> None:
 @law_of("screen filter")
 def keeps_opacities_in_range(screen: ScreenFilter) -> None:
     """Opacities stay in [0, 1], an opacity of 0 stays 0, and all values are finite at any scale."""
-    for (view, convention), sigma, dtype in product(
+    for (view, training), sigma, dtype in product(
         SITUATIONS.values(), (1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6), (torch.float32, F64)
     ):
-        opacities = screen(spheres(sigma).to(dtype), view, trained_with(convention)).opacities
+        opacities = screen(spheres(sigma).to(dtype), view, training).opacities
         require(opacities.min() >= 0 and opacities.max() <= 1 and opacities[0] == 0, f"{opacities} at {sigma} px")
-    for (view, convention), (name, shape) in product(SITUATIONS.values(), EXTREMES.items()):
-        filtered = screen(project(shape(SCENE.to(torch.float32)), view), view, trained_with(convention))
+    for (view, training), (name, shape) in product(SITUATIONS.values(), EXTREMES.items()):
+        filtered = screen(project(shape(SCENE.to(torch.float32)), view), view, training)
         finite = all(value.isfinite().all() for value in copies_of(filtered).values())
         require(finite, f"{name} give values that are not finite")
 
@@ -121,9 +116,9 @@ def keeps_opacities_in_range(screen: ScreenFilter) -> None:
 @law_of("screen filter")
 def keeps_huge_splats(screen: ScreenFilter) -> None:
     """A splat much larger than a pixel keeps its opacity and shape."""
-    for view, convention in SITUATIONS.values():
+    for view, training in SITUATIONS.values():
         splats = spheres(1e4)
-        filtered = screen(splats, view, trained_with(convention))
+        filtered = screen(splats, view, training)
         torch.testing.assert_close(filtered.opacities, splats.opacities, rtol=1e-6, atol=0)
         scale = splats.covs[:, :1]
         torch.testing.assert_close(filtered.covs / scale, splats.covs / scale, rtol=1e-6, atol=1e-6)
@@ -135,11 +130,11 @@ def has_gradients_on_screen(screen: ScreenFilter) -> None:
     splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
     inputs = [x.clone().requires_grad_() for x in (splats.covs, splats.dets, splats.depths, splats.opacities)]
     # not at the training size, where the range of rates ends at the view itself: that is a kink
-    for view, convention in list(SITUATIONS.values())[1:]:
+    for view, training in list(SITUATIONS.values())[1:]:
 
         def filtered(covs: Tensor, dets: Tensor, depths: Tensor, opacities: Tensor) -> tuple[Tensor, ...]:
             given = replace(splats, covs=covs, dets=dets, depths=depths, opacities=opacities)
-            out = screen(given, view, trained_with(convention))  # noqa: B023 (called in the same turn)
+            out = screen(given, view, training)  # noqa: B023 (called in the same turn)
             return out.covs, out.dets, out.opacities
 
         torch.autograd.gradcheck(filtered, inputs)

@@ -57,10 +57,8 @@ class OnDemandKernels(CompiledKernels):
         if self._missing and self._next_look == math.inf:
             self._next_look = time.monotonic() + PATIENCE_SECONDS
             known = self._missing <= {kernel.name for kernel in KERNELS}
-            when = f"after {PATIENCE_SECONDS:.0f} s{', or before it by `aaplug warmup`' * known}"
-            log.warning(
-                "kernels run eagerly, several times slower, until they are compiled: beside this program %s", when
-            )
+            when = f"beside this program after {PATIENCE_SECONDS:.0f} s{', or before it by `aaplug warmup`' * known}"
+            log.warning("kernels run eagerly, several times slower, until they are compiled: %s", when)
         return runner
 
     def _package(self, kernel: Kernel) -> Package | None:
