@@ -79,16 +79,9 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
     path = path or path_of(words)
     from aaplug.methods.conversion import describe
 
-    files = words.of(SceneOptions if "scene" in words.values else FileOptions)
-    scene = aaplug.read_scene(
-        path,
-        iteration=files.iteration if isinstance(files, SceneOptions) else None,
-        convention=None if files.convention is None else CONVENTIONS[files.convention],
-        drop_bad=files.drop_bad,
-        allow_checkpoint=files.allow_checkpoint,
-        spz_axes=files.spz_axes,
-        frames_apart=files.frames_apart,
-    )
+    how: dict[str, Any] = words.keywords(FileOptions) | {"iteration": words.values.get("iteration")}
+    how["convention"] = words.convention and CONVENTIONS[words.convention]
+    scene = aaplug.read_scene(path, **how)
     facts = f"SH degree {scene.sh_degree}, {scene.convention.name} ({scene.evidence})"
     say(f"scene: {scene.path}: {counted(scene.count, 'Gaussian')}, {facts}")
     for note in scene.notes:
@@ -102,14 +95,13 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
 
 def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
     """Read the cameras and say where sizes and split come from; without any, the orbit that stands in for them."""
-    options, orbit = words.of(CameraOptions), words.of(Orbit)
-    path = options.cameras or scene.camera_folder
+    how, orbit = words.keywords(CameraOptions), words.of(Orbit)
+    path = how.pop("cameras") or scene.camera_folder
     if path is None:
         return orbit
     for name, usual in vars(Orbit()).items():
         if name != "monitor" and getattr(orbit, name) != usual:
             raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
-    how = {name: value for name, value in vars(options).items() if name not in ("cameras", "monitor")}
     cameras = aaplug.read_cameras(path, **how)
     for note in cameras.notes:
         say(worded(f"cameras: {note}", options_of(CameraOptions)))

@@ -72,42 +72,37 @@ def run(
 
 def advance(job: TuningJob, state: State) -> None:
     """Take one step, as the method has it; if a loss or gradient is not finite, the step is only counted."""
-    with job.method.around(job, state) as drawings:
-        _step(job, state, drawings)
-
-
-def _step(job: TuningJob, state: State, drawings: list[Drawing] | None) -> None:
-    """The step itself, which adds its drawings to the list if there is one."""
     settings = job.settings
-    view, weights = _view_and_weights(settings, job.views, state.step)
-    state.adam.zero_grad(set_to_none=True)
-    losses = {}
-    for scale, weight in weights.items():
-        loss, drawing = loss_at(job, state, view, scale)
+    with job.method.around(job, state) as drawings:
+        view, weights = _view_and_weights(settings, job.views, state.step)
+        state.adam.zero_grad(set_to_none=True)
+        losses = {}
+        for scale, weight in weights.items():
+            loss, drawing = loss_at(job, state, view, scale)
+            with on_free_cores():
+                (weight * loss).backward()
+            losses[scale] = loss.item()
+            if drawings is not None:
+                drawings.append(drawing)
+        state.step += 1
+        gradients = [leaf.grad for leaf in state.leaves.values() if leaf.grad is not None]
+        if not all(map(math.isfinite, losses.values())) or not all(bool(g.sum().isfinite()) for g in gradients):
+            state.bad_steps += 1
+            return
+        if job.moving is not None:
+            for gradient in gradients:
+                gradient[job.moving :] = 0
+        state.bad_steps = 0
+        state.curve.append({"step": state.step, "view": view.name, "loss": losses})
+        decay = settings.decay ** (state.step / settings.steps) * BACK_OFF**state.rollbacks
+        for group in state.adam.param_groups:
+            size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
+            group["lr"] = settings.rates[group["name"]] * size * decay
         with on_free_cores():
-            (weight * loss).backward()
-        losses[scale] = loss.item()
-        if drawings is not None:
-            drawings.append(drawing)
-    state.step += 1
-    gradients = [leaf.grad for leaf in state.leaves.values() if leaf.grad is not None]
-    if not all(map(math.isfinite, losses.values())) or not all(bool(g.sum().isfinite()) for g in gradients):
-        state.bad_steps += 1
-        return
-    if job.moving is not None:
-        for gradient in gradients:
-            gradient[job.moving :] = 0
-    state.bad_steps = 0
-    state.curve.append({"step": state.step, "view": view.name, "loss": losses})
-    decay = settings.decay ** (state.step / settings.steps) * BACK_OFF**state.rollbacks
-    for group in state.adam.param_groups:
-        size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
-        group["lr"] = settings.rates[group["name"]] * size * decay
-    with on_free_cores():
-        state.adam.step()
-    _clamp_parameters(state)
-    if state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
-        update_bounds(job, state)
+            state.adam.step()
+        _clamp_parameters(state)
+        if state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
+            update_bounds(job, state)
 
 
 def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[Float[Tensor, ""], Drawing]:
