@@ -108,11 +108,7 @@ def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
 
 
 def check_whole(protocol: str, data: Path, found: Found, skip: bool) -> None:
-    """Refuse a set of which scenes are missing, unless they are to be left out; or of which all are.
-
-    Raises:
-        FormatError: names each scene, and what it lacks.
-    """
+    """Refuse a set of which scenes are missing, unless they are to be left out; or of which all are."""
     data_set = DATA_SETS[protocol]
     if found.missing and not (skip and found.scenes):
         what = "; ".join(f"{scene}: {why}" for scene, why in found.missing.items())

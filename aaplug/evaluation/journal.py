@@ -39,10 +39,8 @@ class Journal:
         path: None keeps the views in memory alone.
         fits: True for the place and the measurements of a view that the request asks for.
 
-        Raises:
-            UsageError: the journal is of another request, or another process is writing it.
-            FormatError: it is damaged.
-            OutputError: it cannot be written.
+        Raises UsageError if it is of another request or another process writes it, FormatError if it is damaged, and
+        OutputError if it cannot be written.
         """
         self.views = dict[int, tuple[Measurement, ...]]()
         self._stream: BinaryIO | None = None

@@ -173,9 +173,7 @@ def find_metrics(
     names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift", "ssim:wang"; None for the usual ones.
     lpips_weights: files of LPIPS's trunk and heads, which is then among the metrics; only LPIPS needs them.
 
-    Raises:
-        UsageError: a name is not known or given twice, or a metric lacks what it needs.
-        FormatError: a file of weights cannot be read.
+    Raises UsageError if a name is not known or given twice or a metric lacks what it needs, and FormatError.
     """
     names = default_metrics(protocol) if names is None else (names,) if isinstance(names, str) else names
     parts = [metric_option(name).partition(":") for name in names]

@@ -52,16 +52,11 @@ class Aaplug:
         train_dataset: Mapping[str, Any] | None = None,
         config_overrides: Mapping[str, Any] | None = None,
     ) -> None:
-        """Take a scene and its cameras.
+        """Take a scene and its cameras; raises AaplugError if something is missing or not known.
 
-        Args:
-            checkpoint: a folder that `save` wrote; None for a new one.
-            train_dataset: nerfbaselines' data set that the scene was trained on; needed without a checkpoint.
-            config_overrides: scene (its file), recipe and quality.
-
-        Raises:
-            UsageError: something is missing, or not known.
-            FormatError: a file of the checkpoint is not what `save` writes.
+        checkpoint: a folder that `save` wrote; None for a new one.
+        train_dataset: nerfbaselines' data set that the scene was trained on; needed without a checkpoint.
+        config_overrides: scene (its file), recipe and quality.
         """
         overrides = dict(config_overrides or {})
         path = overrides.pop("scene", None)

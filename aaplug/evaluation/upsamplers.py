@@ -34,9 +34,7 @@ UPSAMPLERS: dict[str, Upsampler] = {"bicubic": bicubic, "lanczos": lanczos}
 def find_upsampler(name: str) -> Upsampler:
     """A built-in upsampler by name, or the network in a file.
 
-    Raises:
-        UsageError: the name is neither.
-        FormatError: the file cannot be read as what its name says.
+    Raises UsageError if the name is neither, and FormatError if the file cannot be read as what its name says.
     """
     if name in UPSAMPLERS:
         return UPSAMPLERS[name]

@@ -156,9 +156,7 @@ def save(path: Path, job: TuningJob, state: State, fallback: Mapping[str, Any]) 
 def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
     """The state of a run of this job, and the snapshot to fall back to.
 
-    Raises:
-        FormatError: the file is damaged, of another version or something else.
-        UsageError: it is of another job; the message names the first difference.
+    Raises FormatError if the file is none of this version, and UsageError, which names a difference, for another job.
     """
     try:
         content = torch.load(path, weights_only=True)

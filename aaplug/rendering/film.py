@@ -22,15 +22,11 @@ def filmed(
 ) -> list[Camera]:
     """The views with an exposure each, where the options or the views themselves ask for one.
 
-    Args:
-        views: at the size to draw; the frames of one motion in order, if `path`.
-        options: they win over what the views and `shutter` say.
-        path: see `views`.
-        shutter: that the path's file asks for, as the option of that name.
-        camera_to: for one view, the camera where the shutter closes, at the same size.
+    views: at the size to draw; the frames of one motion in order, if `path`.
+    options: they win over what the views say, and over `shutter`, which is of the path's file.
+    camera_to: for one view, the camera where the shutter closes, at the same size.
 
-    Raises:
-        UsageError: the focus lies behind a camera, there is no motion to blur, or samples of nothing are asked for.
+    Raises UsageError if the focus lies behind a camera, nothing moves, or samples of nothing are asked for.
     """
     shutter = shutter if options.shutter is None else options.shutter
     if options.samples == 0:

@@ -36,12 +36,9 @@ def write_frames(
     """Render every view to its file, in order.
 
     storage: how; without a background where it holds alpha.
-    apply: calls a function with every item, like `map`; see `core.executors`.
-    tell: called with (views done, views in all).
+    apply: calls a function with every item, like `map`.  tell: called with (views done, views in all).
 
-    Raises:
-        OutputError: an image cannot be written.
-        UsageError: a process died, or the format cannot hold the scene's ids.
+    Raises OutputError if an image cannot be written, and UsageError if the format cannot hold the scene's ids.
     """
     total = len(views)
     if "id" in storage.passes and storage.format.name == "exr" and len(renderer.scene) > MAX_NUMBER:

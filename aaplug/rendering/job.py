@@ -61,16 +61,9 @@ class Job(Generic[O_co]):
 
     @classmethod
     def of(cls, scene: SceneLike, cameras: CamerasLike, options: O, single: bool = False) -> "Job[O]":
-        """Open the scene and its cameras.
+        """Open the scene and its cameras; raises AaplugError.
 
-        Args:
-            scene: a scene, its Gaussians or its path.
-            cameras: themselves, or their path; None for those of the scene's model folder, else an `Orbit`.
-            options: of the verb.
-            single: an orbit is asked for one picture.
-
-        Raises:
-            AaplugError: a file cannot be read, or there is nothing to look at.
+        cameras: None for those of the scene's model folder, else an `Orbit`.  single: it is asked for one picture.
         """
         opened = scene_of(scene, still=not isinstance(options, IN_TIME))
         if cameras is None:
@@ -107,13 +100,11 @@ class Job(Generic[O_co]):
     def look(self: "Job[ViewOptions]", frames: int | None, *, gradients: bool = False, check: bool = True) -> Renderer:
         """The scene as training showed it, with the background and rasterizer that the options ask for.
 
-        Args:
-            frames: number of images that will be rendered in all; None if nobody knows.
-            gradients: each of them is a step of an optimization.
-            check: say how well scene and cameras fit, which takes seconds.
+        frames: number of images that will be rendered in all; None if nobody knows.
+        gradients: each of them is a step of an optimization.
+        check: say how well scene and cameras fit, which takes seconds.
 
-        Raises:
-            FrameError: scene and cameras seem to be of different captures, and `min_seen` is not 0.
+        Raises FrameError if they seem to be of different captures, and `min_seen` is not 0.
         """
         options, say = self.options, self.monitor.say
         colour = background_colour(options.background, self.cameras)
@@ -244,12 +235,9 @@ def running(
     """Limit torch's threads, claim the output and connect the workers that the options name, inside the block.
 
     check: refuses what must not be written.  inputs: files that no output replaces; both see `io.atomic.writing`.
-    folder: the output is one.
-    shared: folder that all workers see; None for the output's.
+    folder: the output is one.  shared: folder that all workers see; None for the output's.
 
-    Raises:
-        OutputError: the output cannot be written.
-        UsageError: the extra `cluster` is missing, nothing answers there, or the workers are unfit.
+    Raises OutputError if the output cannot be written, and UsageError if there are no fit workers.
     """
     threads = getattr(options, "threads", None) or given_threads()
     scheduler = options.scheduler if isinstance(options, RecipeOptions) else None

@@ -63,11 +63,7 @@ class FrameSequence:
         return self.folder / f"{name or 'frames'}.json"
 
     def check(self, overwrite: bool, resume: bool) -> None:
-        """Refuse, before any work, what must not be written.
-
-        Raises:
-            OutputError: a frame exists, and neither `overwrite` nor `resume` is set; or the folder holds further ones.
-        """
+        """Refuse, before any work, frames that exist unless `overwrite` or `resume` is set, and further ones."""
         files = [*self.paths, self.record]
         before, after = PLACES.split(self.pattern.name)
         numbered = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}", re.ASCII)
@@ -84,9 +80,7 @@ class FrameSequence:
     def begin(self, request: Mapping[str, Any], resume: bool) -> list[int]:
         """Places of the frames to draw; removes those that are there unless `resume` is set, and writes the record.
 
-        Raises:
-            UsageError: the frames are of another request.
-            FormatError: the record is damaged.
+        Raises UsageError if the frames are of another request, and FormatError if the record is damaged.
         """
         now = json.loads(json.dumps(request, allow_nan=False))
         if resume and self.record.exists():

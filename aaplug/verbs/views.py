@@ -112,11 +112,7 @@ def names_image(output: Path) -> bool:
 
 
 def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: str = ".png") -> list[Path]:
-    """One file per view in the folder `output`, or `output` itself if it names one image.
-
-    Raises:
-        OutputError: an image exists and `overwrite` is false, it is of no format, or one is named for several views.
-    """
+    """One file per view in the folder `output`, or `output` itself if it names one image; raises OutputError."""
     if names_image(output):
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
             one = f"one {', '.join(SUFFIXES)} for one image"

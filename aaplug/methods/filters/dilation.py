@@ -40,12 +40,11 @@ class Dilation:
 def limited(splats: Splats2D, smallest: float = 0.0, apart: float = 0.0) -> Splats2D:
     """The splats as viewers with limits on a splat's size draw them.
 
-    Args:
-        splats: with what the viewer adds.
-        smallest: px²; a splat whose variance along its longer axis is less is not drawn.
-        apart: px²; half the difference of the variances along a splat's two axes is at least this.  A rounder splat is
-            stretched along u = (xy, apart - (xx - yy) / 2), as GaussianSplats3D does it, and is not drawn if its
-            variance across u is not positive.
+    splats: with what the viewer adds.
+    smallest: px²; a splat whose variance along its longer axis is less is not drawn.
+    apart: px²; half the difference of the variances along a splat's two axes is at least this.  A rounder splat is
+        stretched along u = (xy, apart - (xx - yy) / 2), as GaussianSplats3D does it, and is not drawn if its variance
+        across u is not positive.
     """
     if not (smallest or apart):
         return splats
