@@ -48,7 +48,7 @@ log.propagate = False  # websockets would print a traceback for each bad request
 class Server:
     """Serves a studio's pages; a context, in which it listens.
 
-    open_scene: makes a subject of a scene file.  port 0 takes any free one; raises UsageError if nothing can listen there.
+    open_scene: makes a subject of a scene file.  port 0: any free one; raises UsageError if nothing can listen there.
     """
 
     def __init__(self, studio: Studio, open_scene: Callable[[Path], Subject], host: str, port: int):

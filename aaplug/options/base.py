@@ -192,13 +192,8 @@ class Options:
 def argument_of(annotation: Any) -> Argument | None:
     """The argument that a field's annotation states, or that of a Literal; None for a switch."""
     stated = [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, Argument)]
-    kind = plain(annotation)
+    kind = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
     return stated[0] if stated else names(*get_args(kind)) if get_origin(kind) is Literal else None
-
-
-def plain(annotation: Any) -> Any:
-    """An annotation without its metadata."""
-    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
 
 
 @cache

@@ -34,11 +34,8 @@ from aaplug.system.errors import UsageError, listing
 from aaplug.system.registry import names_of
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
-DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
 COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
-COMPARED_METRICS = ("psnr", "ssim", "flicker")
 METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=None)
-TIMED_RASTERIZERS = ("all", "compiled", "eager")
 USUAL_METHOD = "consistency"  # of fine-tuning
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
@@ -47,9 +44,8 @@ ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the sca
 TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
 RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
 BUILT_IN_PATHS = (*RECEDING_PATHS, "orbit")
-TRUTHS = ("auto", "self", "photographs")
+Source = Literal["auto", "self", "photographs"]  # of the truth
 Layout = Literal["plain", "inria"]
-
 SHOWN_VIEWS = flag("N|NAME,...")
 
 
@@ -118,11 +114,11 @@ class EvaluateOptions(RecipeOptions):
     """Scales, truth, downscaling and flavours of metrics, by name."""
     recipe: Annotated[
         str | Sequence[str | Recipe], names(ALL, kind="recipe", metavar=f"{ALL}|{RECIPE_METAVAR} ...", count=None)
-    ] = DEFAULT_RECIPES
+    ] = ("classic", "mip", "matched", "auto")
     """One or more recipes.  all adds those for comparison, which `aaplug guide methods` lists."""
     scale: Annotated[Sequence[float] | None, SCALES] = None
     """One or more sizes relative to the training size (default: the protocol's)."""
-    truth: Literal["auto", "photographs", "self"] = "auto"
+    truth: Source = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
     poses: Annotated[bool, REPORT] = False
     """Refine the poses of the views on their photographs first: errors that then vanish were the cameras'."""
@@ -152,7 +148,7 @@ class CompareOptions(RecipeOptions):
     """Draw the scenes as spark or another of `aaplug guide viewers` does; the truth stays the first by --recipe."""
     scale: Annotated[Sequence[float], SCALES] = COMPARED_SCALES
     """One or more sizes relative to the training size."""
-    metric: Annotated[str | Sequence[str], METRICS] = COMPARED_METRICS
+    metric: Annotated[str | Sequence[str], METRICS] = ("psnr", "ssim", "flicker")
     """Metrics (default: psnr ssim flicker)."""
     show: Annotated[str, SHOWN_VIEWS, REPORT] = "3"
     """Views in the report's viewer: how many, or which."""
@@ -297,7 +293,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Parameters that move."""
     learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
     """Factor on the method's learning rates."""
-    truth: Annotated[str, names(*TRUTHS)] = "auto"
+    truth: Source = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     poses: Annotated[bool, TUNING] = False
     """Refine the poses of all cameras on their photographs first, for cameras that are slightly off."""
@@ -360,7 +356,7 @@ class BenchOptions(Options):
     """Sizes of the synthetic scenes."""
     resolution: Annotated[Sequence[str] | None, Text(metavar="WxH ...", parsed=size_of, count=None)] = None
     """Sizes of the images: all scenes at the first, the middle one at each (default: a view's or 800x800 1600x1060)."""
-    rasterizer: Annotated[str, names(*TIMED_RASTERIZERS)] = "all"
+    rasterizer: Literal["all", "compiled", "eager"] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
     repeats: Annotated[int, number(1, 1000, whole=True)] = 5
     """Runs per median."""

@@ -40,7 +40,6 @@ DRAWN_AT_ONCE = 1 << 16  # Gaussians; a multiple of 16, so that the random numbe
 EXPONENTIALS = 1 << 18  # at once; their array fits the cache
 EXPONENTIAL_CALLS = 16
 FIELD_OF_VIEW = 50.0  # degrees, of the synthetic camera
-SEED = 0
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ def synthetic_camera(width: int, height: int) -> Camera:
     return centred("bench", (width, height), focal, look_at(eye, target, up))
 
 
-def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:
+def synthetic_scene(n: int, seed: int = 0) -> Gaussians:
     """n Gaussians as trained scenes have them: flat on surfaces, overlapping alike at every n, opacities near 0 and 1.
 
     A ball, the ground and a dome around them; a few needles and a few large faint ones form the tail.

@@ -8,7 +8,7 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.culling import cull
 from aaplug.core.imaging import average_samples
-from aaplug.core.splats import Render, Splats2D
+from aaplug.core.splats import Render
 from aaplug.rendering.renderer import Renderer
 
 SAMPLES_PER_STRIP = 1 << 19  # some 30 ms on two cores
@@ -36,18 +36,14 @@ def strips(
         yield
         above, below = max(0, top - HALO), min(camera.height, top + rows + HALO)
         hw = (below - above) * samples, (end - start) * samples
-        moved = _moved(splats, -start * samples, -above * samples, hw)
+        x, y = start * samples, above * samples  # the strip's corner, from which its splats are seen
+        seen = splats.camera
+        if seen is not None:
+            seen = replace(seen, cx=seen.cx - x, cy=seen.cy - y, height=hw[0], width=hw[1])
+        moved = replace(splats, means=splats.means - splats.means.new_tensor([x, y]), camera=seen)
         ellipses = pixel.bounding_ellipses(moved, rules)
         visible = cull(moved, hw, kernels=renderer.kernels, ellipses=ellipses, rules=rules)
         strip = average_samples(renderer.paint(visible, hw), samples, weight)
         inner = slice(top - above, top - above + rows), slice(left - start, right - start)
         parts.append((strip.rgb[inner], strip.alpha[inner]))
     return Render(*(torch.cat(images) for images in zip(*parts, strict=True)))
-
-
-def _moved(splats: Splats2D, right: int, down: int, hw: tuple[int, int]) -> Splats2D:
-    """The splats as a camera sees them whose image is a part of theirs, of height and width `hw` px."""
-    camera = splats.camera
-    if camera is not None:
-        camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down, height=hw[0], width=hw[1])
-    return replace(splats, means=splats.means + splats.means.new_tensor([right, down]), camera=camera)

@@ -46,7 +46,6 @@ const picture = once(async (uri) => { // a canvas that holds the image
   return sheet;
 });
 
-const errorMap = (uri, truth) => errorsAgainst(truth)(uri);
 const errorsAgainst = once((truth) => once(async (uri) => { // the worst channel's difference at each pixel, and the largest of all
   const sheets = await Promise.all([picture(uri), picture(truth)]);
   const {width, height} = sheets[0];

@@ -66,7 +66,7 @@ async function pane(role) { // what one side shows, and the words above it
     if (state.error) words.push(`no ${gallery.truthName} at this scale: the image itself`);
     return {sheet: await picture(uri), label: words.join(" · ")};
   }
-  const {map, largest} = await errorMap(uri, images[gallery.truth].uri);
+  const {map, largest} = await errorsAgainst(images[gallery.truth].uri)(uri);
   const same = role === gallery.truth ? "compared with itself: no error" : `equal to the ${gallery.truthName}: no error`;
   words.push(largest ? `largest error ${largest} of 255` : same);
   return {sheet: map, label: words.join(" · ")};
