@@ -34,7 +34,7 @@ from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import suited
-from aaplug.rendering.cost import Cost, comparing, cost_of
+from aaplug.rendering.cost import COMPARED, Cost, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import UsageError
@@ -135,7 +135,8 @@ class Task:
         else:
             looks = map(self.truth.supersampled, self.scales)
             truths = [cost_of([look], sized[i::count]) for i, look in enumerate(looks)]
-        seconds = images.seconds + sum(cost.seconds for cost in truths) + comparing(sized, len(self.rows))
+        compared = len(self.rows) * sum(view.width * view.height for view in sized)  # px
+        seconds = images.seconds + sum(cost.seconds for cost in truths) + COMPARED * compared
         return images._replace(seconds=seconds, image=max(images.image, *(cost.image for cost in truths)))
 
     @property

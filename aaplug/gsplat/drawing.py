@@ -25,7 +25,7 @@ from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.rendering import channels
+from aaplug.rendering import passes
 from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
@@ -129,7 +129,7 @@ def composited(
 ) -> Image:
     """Premultiplied channels, and alpha.  per_call: the numbers of channels of which one is drawn at a time."""
     rules = options.convention.rules
-    image = channels.composited(
+    image = passes.composited(
         splats, features, lambda part: rasterizer(part, options.hw, BLACK, pixel, None, rules), per_call
     )
     return image.rgb, image.alpha[..., None]

@@ -38,8 +38,3 @@ def cost_of(renderers: Iterable[Renderer], views: Iterable[Camera]) -> Cost:
             max(found.image, SAMPLE_BYTES * max(samples, default=0)),
         )
     return found
-
-
-def comparing(views: Iterable[Camera], images: int) -> float:
-    """Seconds that it takes to compare so many images of every view with its truth."""
-    return images * COMPARED * sum(view.width * view.height for view in views)

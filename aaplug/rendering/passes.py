@@ -15,12 +15,13 @@ front of it:
 Where nothing is, an id is -1 and everything else 0.  m: splats; h, w: px of the pixels; H, W: of the samples.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
@@ -108,6 +109,23 @@ def expected(
     if "position" in found:
         found["position"] = torch.where(covered, found["position"].double() + camera.centre, 0.0).to(means)
     return {name: part if part.shape[2] > 1 else part[..., 0] for name, part in found.items()}
+
+
+def composited(
+    splats: Splats2D, channels: Float[Tensor, "m d"], draw: Callable[[Splats2D], Render], per_call: Sequence[int]
+) -> Render:
+    """Premultiplied channels of splats beside their colours, composited as colours are, and alpha.
+
+    d: channels.  draw: composites coloured splats over black.  per_call: numbers of channels, one of which is drawn at
+        a time.
+    """
+    width = channels.shape[1]
+    at_once = min(per_call, key=lambda count: -(-width // count))
+    parts = pad(channels, (0, -width % at_once)).split(at_once, dim=1)
+    images = [draw(replace(splats, rgb=part)) for part in parts]
+    planes = [image.rgb.movedim(2, 0) for image in images]  # as they lie in memory
+    planes[-1] = planes[-1][: width - at_once * (len(planes) - 1)]
+    return Render(torch.cat(planes).movedim(0, 2), images[0].alpha)
 
 
 def _growth(splats: Splats2D, scene: Gaussians, camera: Camera) -> Float[Tensor, "m 2"]:

@@ -50,8 +50,7 @@ from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer, kernels_of
-from aaplug.rendering.channels import composited
-from aaplug.rendering.passes import by_order, expected
+from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of, within_memory
