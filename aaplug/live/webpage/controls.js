@@ -91,7 +91,7 @@ at("panel").addEventListener("input", ({target: {id, name, value, checked}}) => 
 const clicks = {
   flip, half: () => change({split: 0.5}), weaker: () => change({lens: true, zoom: state.zoom / 2}),
   stronger: () => change({lens: true, zoom: state.zoom * 2}), previous: () => stepCamera(-1), next: () => stepCamera(1),
-  path: savePath, still: saveStill, command: copyCommand, fold, full: fullScreen, asTrained: () => change({background: null}),
+  path: () => savePath(path, "camera_path.json"), still: saveStill, command: copyCommand, fold, full: fullScreen, asTrained: () => change({background: null}),
 };
 for (const [id, act] of Object.entries(clicks)) at(id).addEventListener("click", act);
 
@@ -115,14 +115,11 @@ function download(file, name) {
   say(`saved ${name}`);
 }
 
-function pathOf(frames) {
+function savePath(frames, name) {
   const [width, height] = extent().size;
   const cameras = frames.map(({time, ...frame}) => ({...frame, aspect: width / height}));
-  return JSON.stringify({camera_type: "perspective", render_width: width, render_height: height, fps: FPS, seconds: frames.length / FPS, camera_path: cameras});
-}
-
-function savePath() {
-  download(new Blob([pathOf(path)], {type: "application/json"}), "camera_path.json");
+  const text = JSON.stringify({camera_type: "perspective", render_width: width, render_height: height, fps: FPS, seconds: frames.length / FPS, camera_path: cameras});
+  download(new Blob([text], {type: "application/json"}), name);
 }
 
 const sideSeen = () => state.split < 1 ? 1 : 0; // the right one, while some of it shows
@@ -143,7 +140,7 @@ async function copyCommand() { // and save the camera that it names
   const {id, stage: now, camera, size: [, height]} = livePicture;
   if (now !== "done" || id !== number) return say("wait until the picture is at rest");
   const fov = Math.atan(height / 2 / camera.fl_y) * 360 / Math.PI, words = commandLine();
-  download(new Blob([pathOf([{camera_to_world: worldFromCamera(state.pose), fov, ...camera}])], {type: "application/json"}), VIEW_FILE);
+  savePath([{camera_to_world: worldFromCamera(state.pose), fov, ...camera}], VIEW_FILE);
   const what = `where ${VIEW_FILE} is saved, run: ${words}`;
   await navigator.clipboard.writeText(words).then(() => say(`copied; ${what}`), () => say(what));
 }

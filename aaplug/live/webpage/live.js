@@ -48,16 +48,12 @@ function shaken(now) { // the pose, moved by fractions of a pixel
   return looked(state.pose, x, y);
 }
 
-function wish(now) {
-  const {size: [width, height], focal} = extent();
-  return {pose: shaken(now), focal, width, height, sides: state.sides, at: state.shake ? null : state.at,
-    paint: state.paint, photo: state.at !== null && view().photo, background: state.background};
-}
-
 function frame(now) { // asks for what has changed, and says when the camera rests
   waiting = 0;
   if (!about || !state.sides.length) return;
-  const wanted = wish(now), key = JSON.stringify(wanted), fresh = key !== asked;
+  const {size: [width, height], focal} = extent(), {sides, paint, background} = state;
+  const wanted = {pose: shaken(now), focal, width, height, sides, paint, background, at: state.shake ? null : state.at, photo: state.at !== null && view().photo};
+  const key = JSON.stringify(wanted), fresh = key !== asked;
   if (fresh) changed = now;
   const rests = now - changed > REST_MS && !state.shake;
   if (fresh || (rests && moving)) {

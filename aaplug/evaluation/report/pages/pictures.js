@@ -17,11 +17,10 @@ function toggles(parent, type, name, values, text = String) { // a row of radio 
   }));
 }
 
-function heat(level) { // colour of an error in levels of 255
+const HEAT = Array.from({length: 256}, (_, level) => { // colours of errors in levels of 255
   const t = Math.min(1, level / ERROR_FULL) * (HEAT_STOPS.length - 1), i = Math.min(HEAT_STOPS.length - 2, Math.floor(t));
   return HEAT_STOPS[i].map((a, c) => a + (HEAT_STOPS[i + 1][c] - a) * (t - i));
-}
-const HEAT = Array.from({length: 256}, (_, level) => heat(level));
+});
 
 function sheetOf(width, height) {
   const sheet = document.createElement("canvas");
