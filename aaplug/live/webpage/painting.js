@@ -7,11 +7,6 @@ const OVERLAY_ALPHA = 190; // of 255: how far what is painted hides the picture
 const PICK_RADIUS_PX = 18; // CSS px around a camera in which it is picked
 const FRUSTUM_DEPTH = 0.04; // of the distance to the scene
 
-function ramp(stops, share) {
-  const at = share * (stops.length - 1), i = Math.min(stops.length - 2, Math.floor(at));
-  return stops[i].map((a, c) => Math.round(a + (stops[i + 1][c] - a) * (at - i)));
-}
-
 const stopsOf = (legend) => legend.middle === null ? GROWING_COLOURS : TWO_SIDED_COLOURS;
 
 function valueAt(legend, share) {

@@ -17,10 +17,11 @@ function toggles(parent, type, name, values, text = String) { // a row of radio 
   }));
 }
 
-const HEAT = Array.from({length: 256}, (_, level) => { // colours of errors in levels of 255
-  const t = Math.min(1, level / ERROR_FULL) * (HEAT_STOPS.length - 1), i = Math.min(HEAT_STOPS.length - 2, Math.floor(t));
-  return HEAT_STOPS[i].map((a, c) => a + (HEAT_STOPS[i + 1][c] - a) * (t - i));
-});
+function ramp(stops, share) { // the colour between evenly spaced ones
+  const at = share * (stops.length - 1), i = Math.min(stops.length - 2, Math.floor(at));
+  return stops[i].map((a, c) => Math.round(a + (stops[i + 1][c] - a) * (at - i)));
+}
+const HEAT = Array.from({length: 256}, (_, level) => ramp(HEAT_STOPS, Math.min(1, level / ERROR_FULL))); // of errors in levels of 255
 
 function sheetOf(width, height) {
   const sheet = document.createElement("canvas");
