@@ -73,7 +73,7 @@ from .core.spherical_harmonics import COLOUR_OFFSET as COLOUR_OFFSET, SH_C0 as S
 from .core.spectra import frequency_response as frequency_response
 from .core.splats import Splats2D as Splats2D
 from .io.atomic import replacing as replacing
-from .io.cameras.options import CameraFileOptions as CameraFileOptions
+from .io.cameras.sets import CameraFileOptions as CameraFileOptions
 from .io.scenes.columns import logit_of as logit_of, sh_of_colour as sh_of_colour
 from .io.scenes.options import SceneFileOptions as SceneFileOptions
 from .io.scenes.rows import check_count as check_count, library_errors as library_errors

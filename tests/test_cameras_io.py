@@ -17,7 +17,7 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
-from aaplug.io.cameras.options import CameraFileOptions
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera

@@ -28,8 +28,8 @@ from aaplug.io.cameras import (
     usd,
 )
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.photos import files_of
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, UsageError, listing
 from aaplug.system.registry import Registry, named

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import CameraSet
 from aaplug.io.cameras import transforms
-from aaplug.io.cameras.options import CameraFileOptions, explicit
+from aaplug.io.cameras.sets import CameraFileOptions, explicit
 from aaplug.io.cameras.transforms import Source, read_source, set_of, trained
 from aaplug.system.errors import UsageError
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred
-from aaplug.io.cameras.options import CameraFileOptions, described_sizes, file_sizes, undivided
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.cameras.sets import CameraFileOptions, described_sizes, file_sizes, undivided
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError, counted
 

@@ -16,20 +16,12 @@ import torch
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, Lens, opencv_lens
 from aaplug.core.projection import rotation_matrices
+from aaplug.io.cameras import sets
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
-from aaplug.io.cameras.options import (
-    LLFF_HOLD,
-    CameraFileOptions,
-    Size,
-    camera_set,
-    every_nth,
-    file_sizes,
-    photo_sizes,
-    trained_at,
-)
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
 from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
@@ -77,10 +69,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     sizes, why = _training_sizes(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
-    trained = cameras_of_photographs(trained_at(source, sizes), lenses, options.undistort)
-    split = every_nth(trained, options, LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
+    trained = cameras_of_photographs(sets.trained_at(source, sizes), lenses, options.undistort)
+    split = sets.every_nth(trained, options, sets.LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
-    return camera_set(kind, source, split, why, more=lens_notes(lenses, trained, options.undistort))
+    return sets.camera_set(kind, source, split, why, more=lens_notes(lenses, trained, options.undistort))
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -101,11 +93,11 @@ def _files(folder: Path) -> tuple[Path, Path]:
     raise FormatError(folder, f"{needs}; found {there or 'neither'}")
 
 
-def _training_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
+def _training_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[sets.Size], str]:
     if options.train_scale is not None:
-        return file_sizes(cameras, options)
+        return sets.file_sizes(cameras, options)
     there = sum(camera.photo is not None for camera in cameras)
-    sizes = photo_sizes(cameras)
+    sizes = sets.photo_sizes(cameras)
     why = f"size of the {there} photos found" if there else "size in the file, no photos found"
     if max(width for width, _ in sizes) > WIDTH_CAP:
         why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: `train_scale` sets it"

@@ -14,22 +14,11 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import BLACK, WHITE
-from aaplug.io.cameras import cfg_args
+from aaplug.io.cameras import cfg_args, sets
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
-from aaplug.io.cameras.options import (
-    LLFF_HOLD,
-    CameraFileOptions,
-    Size,
-    Split,
-    camera_set,
-    every_nth,
-    explicit,
-    file_sizes,
-    photo_sizes,
-    trained_at,
-)
 from aaplug.io.cameras.photos import photo_folder, with_photos
 from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
 
 FILE = "cameras.json"
@@ -59,9 +48,9 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
     source = list(views.values())
     sizes, why = _training_sizes(source, settings, options)
-    split = _split(trained_at(source, sizes), settings, options)
+    split = _split(sets.trained_at(source, sizes), settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
-    return camera_set("INRIA cameras.json", source, split, why, background)
+    return sets.camera_set("INRIA cameras.json", source, split, why, background)
 
 
 class Model:
@@ -91,14 +80,14 @@ def _camera(entry: Entry) -> Camera:
 
 def _training_sizes(
     cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions
-) -> tuple[list[Size], str]:
+) -> tuple[list[sets.Size], str]:
     """3DGS's rule, applied to the sizes of the photos that training loaded; and the reason, for a note."""
     if options.train_scale is not None:
-        return file_sizes(cameras, options)
+        return sets.file_sizes(cameras, options)
     run = settings or CfgArgs()
     n = run.divisor
     if any(camera.photo for camera in cameras):
-        loaded, why = photo_sizes(cameras), "size of the photos"
+        loaded, why = sets.photo_sizes(cameras), "size of the photos"
     else:  # tools that make images_N folders round halves up; Python rounds them to even
         loaded = [tuple(max(1, math.floor(side / n + 0.5)) for side in (c.width, c.height)) for c in cameras]
         why = "size in the file" + (f" / {n} for {run.images}" if n > 1 else "")
@@ -108,7 +97,7 @@ def _training_sizes(
     return [run.size(*size) for size in loaded], f"{why}, {rule}"
 
 
-def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> Split:
+def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> sets.Split:
     """The split by name, or by order where the names begin again: Blender's test views r_0, ..., then training's."""
     held_out = settings is not None and settings.held_out
     counts, occurrences = Counter[str](), list[int]()
@@ -118,10 +107,10 @@ def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraF
     second = next((index for index, times in enumerate(occurrences) if times > 1), len(cameras))
     again = [camera.name for camera in cameras[second:]]
     if held_out and options.test_every is None and again and len(set(again)) == len(again):
-        return explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
+        return sets.explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
     pairs = zip(cameras, occurrences, strict=True)
     renamed = [camera if times == 1 else replace(camera, name=f"{camera.name}~{times}") for camera, times in pairs]
     ordered = sorted(renamed, key=lambda camera: camera.name)
     if settings is None:
-        return every_nth(ordered, options, 0, "no cfg_args; `test_every` 8 is 3DGS's rule")
-    return every_nth(ordered, options, LLFF_HOLD if held_out else 0, f"eval={held_out} in cfg_args")
+        return sets.every_nth(ordered, options, 0, "no cfg_args; `test_every` 8 is 3DGS's rule")
+    return sets.every_nth(ordered, options, sets.LLFF_HOLD if held_out else 0, f"eval={held_out} in cfg_args")

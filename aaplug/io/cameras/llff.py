@@ -13,17 +13,10 @@ import numpy as np
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet, centred
-from aaplug.io.cameras.options import (
-    LLFF_HOLD,
-    CameraFileOptions,
-    camera_set,
-    every_nth,
-    file_sizes,
-    photo_sizes,
-    trained_at,
-)
+from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
 from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, focal, number, pixels, read_bounded
 from aaplug.system.errors import FormatError
@@ -55,10 +48,11 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
-    photo_rule = photo_sizes(source), "size of the photos, or in the file"
-    sizes, why = photo_rule if options.train_scale is None else file_sizes(source, options)
-    split = every_nth(trained_at(source, sizes), options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
-    return camera_set(f"LLFF {FILE}", source, split, why)
+    photo_rule = sets.photo_sizes(source), "size of the photos, or in the file"
+    sizes, why = photo_rule if options.train_scale is None else sets.file_sizes(source, options)
+    trained = sets.trained_at(source, sizes)
+    split = sets.every_nth(trained, options, sets.LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
+    return sets.camera_set(f"LLFF {FILE}", source, split, why)
 
 
 def _rows(file: Path) -> np.ndarray:

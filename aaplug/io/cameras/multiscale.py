@@ -10,9 +10,9 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import WHITE
-from aaplug.io.cameras.options import CameraFileOptions, described_sizes, explicit, file_sizes, trained_at, undivided
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.sets import CameraFileOptions, described_sizes, explicit, file_sizes, trained_at, undivided
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
 from aaplug.system.errors import UsageError, counted
 

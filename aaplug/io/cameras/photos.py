@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
-from aaplug.io.cameras.options import CameraFileOptions
+from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.values import Place
 from aaplug.system.errors import FormatError, UsageError, listing
 

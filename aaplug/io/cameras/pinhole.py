@@ -7,9 +7,9 @@ world_to_camera is 4×4, row by row, OpenCV axes.
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import CameraFileOptions, camera_set, every_nth, file_sizes, trained_at
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose, rigid
+from aaplug.io.cameras.sets import CameraFileOptions, camera_set, every_nth, file_sizes, trained_at
 from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
 
 name = "pinhole"

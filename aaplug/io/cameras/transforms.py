@@ -22,33 +22,13 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.lenses import EQUIRECT, opencv_lens
-from aaplug.io.cameras.options import (
-    CameraFileOptions,
-    Size,
-    Split,
-    camera_set,
-    every_nth,
-    explicit,
-    file_sizes,
-    trained_at,
-)
+from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
+from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import PNG_SIGNATURE, image_size
 from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
-from aaplug.io.values import (
-    Entry,
-    Place,
-    entries,
-    focal,
-    mentions,
-    number,
-    object_of,
-    pixels,
-    read_json,
-    read_start,
-    text,
-)
+from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json, read_start, text
 from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
@@ -102,24 +82,24 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     if source.held_out is not None and options.test_every is None:
         pairs = list(zip(cameras, source.held_out, strict=True))
         train, test = ([camera for camera, out in pairs if out == held] for held in (False, True))
-        return set_of(source, explicit(train, test, "lists of file names"), options)
+        return set_of(source, sets.explicit(train, test, "lists of file names"), options)
     if options.test_every:
         cameras = sorted(cameras, key=lambda camera: camera.name)
-    return set_of(source, every_nth(cameras, options, 0, f"only {file.name} read"), options)
+    return set_of(source, sets.every_nth(cameras, options, 0, f"only {file.name} read"), options)
 
 
-def set_of(source: Source, split: Split, options: CameraFileOptions) -> CameraSet:
+def set_of(source: Source, split: sets.Split, options: CameraFileOptions) -> CameraSet:
     """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
     headers = (read_start(camera.photo, PNG_COLOUR_TYPE + 1) for camera in source.cameras if camera.photo)
     alpha = any(h.startswith(PNG_SIGNATURE) and h[PNG_COLOUR_TYPE:] in PNG_ALPHA for h in headers)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
-    why, background = file_sizes(source.cameras, options)[1], WHITE if alpha else None
-    return camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
+    why, background = sets.file_sizes(source.cameras, options)[1], WHITE if alpha else None
+    return sets.camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
 
 
 def trained(source: Source, options: CameraFileOptions) -> list[Camera]:
     """The source's cameras at their training size."""
-    return trained_at(source.cameras, file_sizes(source.cameras, options)[0])
+    return sets.trained_at(source.cameras, sets.file_sizes(source.cameras, options)[0])
 
 
 def read_source(file: Path, options: CameraFileOptions) -> Source:
@@ -186,7 +166,8 @@ def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tup
         return None
     for key, listed in lists.items():
         right = isinstance(listed, list) and all(isinstance(path, str) for path in listed)
-        Place(file, "lists of file names").expect(right, key, "a list of paths", listed)
+        place = object_of(document, file, "lists of file names", "frames").place
+        place.expect(right, key, "a list of paths", listed)
     train = set(lists[FILE_LISTS[0]])
     return tuple(path not in train for path in paths)
 
