@@ -20,7 +20,7 @@ from torch import Tensor
 
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import Entry, Place, entries, number, object_of, parse_json, read_bounded, read_part, text
+from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, read_bounded, read_part, text
 from aaplug.system.errors import FormatError
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, 0x4E4F534A, 0x004E4942
@@ -177,13 +177,6 @@ class Gltf:
         if file not in self.files:
             self.files.append(file)
         return Buffer(file, size)
-
-
-def natural(value: object, place: Place, field: str, most: int) -> int:
-    """`value` as a whole number from 0 to `most`."""
-    real = number(value, place, field)
-    place.expect(0 <= real <= most and real.is_integer(), field, f"a whole number from 0 to {most}", value)
-    return int(real)
 
 
 def at_rest(node: Entry) -> Float[Tensor, "4 4"]:

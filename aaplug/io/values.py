@@ -110,16 +110,17 @@ def focal(value: object, place: Place, field: str) -> float:
     return real
 
 
-def whole(value: object, place: Place, field: str, most: int, unit: str = "") -> int:
-    """`value` as a whole number from 1 to `most`, in a unit."""
+def natural(value: object, place: Place, field: str, most: int, least: int = 0, unit: str = "") -> int:
+    """`value` as a whole number from `least` to `most`, in a unit."""
     real = number(value, place, field)
-    place.expect(1 <= real <= most and real.is_integer(), field, f"a whole number{unit} from 1 to {most}", value)
+    right = least <= real <= most and real.is_integer()
+    place.expect(right, field, f"a whole number{unit} from {least} to {most}", value)
     return int(real)
 
 
 def pixels(value: object, place: Place, field: str) -> int:
     """`value` as the side of an image, in px."""
-    return whole(value, place, field, whole_limit("CAMERA_SIDE"), " of px")
+    return natural(value, place, field, whole_limit("CAMERA_SIDE"), 1, " of px")
 
 
 def text(value: object, place: Place, field: str) -> str:
@@ -131,18 +132,13 @@ def text(value: object, place: Place, field: str) -> str:
 
 def read_start(path: Path, size: int) -> bytes:
     """The first bytes of a file, or all if it has fewer."""
-    if not os.path.isfile(path):  # reading a pipe would block
-        raise FormatError(path, "is not an ordinary file" if os.path.exists(path) else "cannot be read: no such file")
-    try:
-        with path.open("rb") as file:
-            return file.read(size)
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {reason(error)}") from error
+    return read_part(path, 0, size, short=True)
 
 
 def read_part(path: Path, start: int, size: int, short: bool = False) -> bytes:
     """`size` bytes of a file from `start`; fewer are an error unless `short`."""
-    read_start(path, 0)  # checks that it is an ordinary file
+    if not os.path.isfile(path):  # reading a pipe would block
+        raise FormatError(path, "is not an ordinary file" if os.path.exists(path) else "cannot be read: no such file")
     try:
         with path.open("rb") as file:
             file.seek(start)

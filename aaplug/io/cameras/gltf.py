@@ -19,8 +19,8 @@ from aaplug.io.cameras import keyframes
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, segments, slerp
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, pose
-from aaplug.io.gltf import Gltf, at_rest, natural
-from aaplug.io.values import Entry, Place, entries, number, text
+from aaplug.io.gltf import Gltf, at_rest
+from aaplug.io.values import Entry, Place, entries, natural, number, text
 from aaplug.system.errors import FormatError
 
 PATHS = {"translation": "VEC3", "rotation": "VEC4"}  # that move a camera
@@ -81,7 +81,7 @@ def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
             node = natural(target.value("node"), target.place, "node", nodes - 1)
             sampler = samplers[natural(channel.value("sampler"), channel.place, "sampler", len(samplers) - 1)]
             times = file.numbers(sampler, "input", "SCALAR")[:, 0]
-            keyframes.rising(times, sampler.place, "times")
+            keyframes.rising(times, sampler.place)
             values, way = file.numbers(sampler, "output", PATHS[kind]), sampler.get("interpolation", text, "LINEAR")
             sampler.place.expect(way in ("LINEAR", "STEP", "CUBICSPLINE"), "interpolation", "glTF's", way)
             rows = len(times) * (3 if way == "CUBICSPLINE" else 1)
@@ -97,7 +97,7 @@ def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -
     if "translation" in channels:
         motions[:, :3, 3] = _sampled(channels["translation"], at, node.place, False)
     if "rotation" in channels:
-        quats = keyframes.unit(_sampled(channels["rotation"], at, node.place, True), node.place, "rotation")
+        quats = keyframes.unit(_sampled(channels["rotation"], at, node.place, True), node.place)
         sizes = node.vector("scale", 3) if "scale" in node else 1.0
         motions[:, :3, :3] = rotation_matrices(quats.roll(1, dims=1)) * sizes
     return motions
@@ -115,7 +115,7 @@ def _sampled(channel: Channel, at: Float[Tensor, " f"], place: Place, turns: boo
     if way == "STEP":
         return values[torch.where(share < 1 - EVEN, index, after)]  # times are float32
     if turns:
-        values = keyframes.unit(values, place, "rotation")
+        values = keyframes.unit(values, place)
         return slerp(values[index], values[after], share)
     return values[index].lerp(values[after], share[:, None])
 

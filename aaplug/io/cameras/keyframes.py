@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import WHOLE_SLACK, Camera, centred
-from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras.poses import inverse
 from aaplug.io.values import Place, focal
 
@@ -28,9 +27,9 @@ def frame_times(first: float, last: float, fps: float, place: Place) -> Float[Te
     return first + torch.arange(math.floor(steps + WHOLE_SLACK) + 1, dtype=torch.float64) / fps
 
 
-def rising(times: Float[Tensor, " n"], place: Place, field: str) -> Float[Tensor, " n"]:
+def rising(times: Float[Tensor, " n"], place: Place) -> Float[Tensor, " n"]:
     """The times of keys, which rise."""
-    place.expect(bool((times.diff() > 0).all()), field, "rising", times.tolist())
+    place.expect(bool((times.diff() > 0).all()), "times", "rising", times.tolist())
     return times
 
 
@@ -64,19 +63,12 @@ def slerp(first: Float[Tensor, "f 4"], last: Float[Tensor, "f 4"], share: Float[
     return torch.from_numpy((start * Rotation.from_rotvec(share[:, None].numpy() * way)).as_quat())
 
 
-def unit(quats: Float[Tensor, "n 4"], place: Place, field: str) -> Float[Tensor, "n 4"]:
+def unit(quats: Float[Tensor, "n 4"], place: Place) -> Float[Tensor, "n 4"]:
     """Quaternions of length 1."""
     lengths = quats.norm(dim=1, keepdim=True)
     wrong = ~((lengths > MIN_LENGTH) & lengths.isfinite())[:, 0]  # squares of large numbers are infinite
-    place.expect(not wrong.any(), field, "a length above 0 and finite", quats.tolist()[int(wrong.int().argmax())])
+    place.expect(not wrong.any(), "rotation", "a length above 0 and finite", quats.tolist()[int(wrong.int().argmax())])
     return quats / lengths
-
-
-def rigid_motions(quats: Float[Tensor, "f 4"], places: Float[Tensor, "f 3"]) -> Float[Tensor, "f 4 4"]:
-    """Matrices of unit quaternions wxyz and translations."""
-    motions = torch.eye(4, dtype=torch.float64).repeat(len(quats), 1, 1)
-    motions[:, :3, :3], motions[:, :3, 3] = rotation_matrices(quats), places
-    return motions
 
 
 def cameras_of(

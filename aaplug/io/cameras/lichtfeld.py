@@ -10,9 +10,9 @@ from pathlib import Path
 
 import torch
 
-from aaplug.io.cameras import keyframes
+from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.keyframes import FPS, cameras_of, frame_times, hermite, rigid_motions, rising, segments, slerp
+from aaplug.io.cameras.keyframes import FPS, cameras_of, frame_times, hermite, rising, segments, slerp, unit
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL
 from aaplug.io.values import entries, mentions, number, object_of, read_json
 
@@ -40,10 +40,9 @@ def path_of(path: Path) -> CameraPath:
     version = about.get("version", number, 1.0)
     about.place.expect(version in range(1, LAST_VERSION + 1), "version", f"1 to {LAST_VERSION}", version)
     keys = sorted(entries(path, "keyframe", about.fields["keyframes"]), key=lambda key: key.get("time", number))
-    times = rising(torch.tensor([key.get("time", number) for key in keys], dtype=torch.float64), about.place, "times")
+    times = rising(torch.tensor([key.get("time", number) for key in keys], dtype=torch.float64), about.place)
     places = torch.stack([key.vector("position", 3) for key in keys])
-    quats = keyframes.unit(torch.stack([key.vector("rotation", 4) for key in keys]), about.place, "rotation")
-    quats = quats.roll(-1, dims=1)  # xyzw
+    quats = unit(torch.stack([key.vector("rotation", 4) for key in keys]), about.place).roll(-1, dims=1)  # xyzw
     focals = torch.tensor([key.get("focal_length_mm", number) for key in keys], dtype=torch.float64)
     easings = [key.get("easing", number, 0.0) for key in keys]
     for key, easing, focal in zip(keys, easings, focals.tolist(), strict=True):
@@ -57,9 +56,9 @@ def path_of(path: Path) -> CameraPath:
     padded = torch.cat([places[:1], places, places[-1:]])
     slopes = (padded[2:] - padded[:-2]) / 2
     points = hermite(places[index], slopes[index], slopes[after], places[after], share)
-    motions = rigid_motions(slerp(quats[index], quats[after], share).roll(1, dims=1), points)
-    motions[:, :3] *= WORLD[:, None]
-    motions[:, :3, :3] *= OPENCV_FROM_OPENGL
+    motions = torch.eye(4, dtype=torch.float64).repeat(len(at), 1, 1)
+    turns = rotation_matrices(slerp(quats[index], quats[after], share).roll(1, dims=1))
+    motions[:, :3, :3], motions[:, :3, 3] = WORLD[:, None] * turns * OPENCV_FROM_OPENGL, WORLD * points
     tangents = SENSOR_HEIGHT / 2 / focals[index].lerp(focals[after], share)
     cameras = cameras_of(motions, tangents, lambda size: size[1], about.place)
     return CameraPath(cameras, FPS, unsized=True)

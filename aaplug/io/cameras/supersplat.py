@@ -11,7 +11,6 @@ the sources, not documented, and may change.
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -31,18 +30,6 @@ FOV = 60.0  # degrees, if nothing says
 name = "supersplat"
 
 
-class Track(NamedTuple):
-    """Keys in frames, their values (position, target, fov), and how they are played."""
-
-    times: Float[Tensor, " n"]
-    values: Float[Tensor, "n 7"]
-    frames: float
-    fps: float
-    smoothness: float
-    loops: bool
-    holds: bool
-
-
 def sniff(path: Path) -> bool:
     """True for a file with animations."""
     return mentions(path, ["animTracks"])
@@ -51,18 +38,26 @@ def sniff(path: Path) -> bool:
 def path_of(path: Path) -> CameraPath:
     """The frames of the first animation."""
     about = object_of(read_json(path), path, "it", "'animTracks', as SuperSplat writes", "animTracks")
-    track = _track(about)
-    times = rising(track.times, about.place, "times")
-    at = frame_times(0.0, track.frames - 1, 1.0, about.place)
-    times, values = _looped(track) if track.loops else (times, track.values)
+    version = about.fields.get("version", 1)
+    about.place.expect(version in (1, 2), "version", "1 or 2", version)
+    [track, *_] = entries(path, "track", about.fields["animTracks"])
+    fps, smoothness = track.get("frameRate", number, FPS), track.get("smoothness", number, 0.0)
+    track.place.expect(fps > 0, "frameRate", "above 0", fps)
+    frames, (times, values) = track.get("duration", number) * fps, _keys(about, track.entry("keyframes"))
+    times = rising(times * (1 if "frameRate" in track else fps), about.place)  # early files count times in s
+    at = frame_times(0.0, frames - 1, 1.0, about.place)
+    inside = times < frames
+    if track.fields.get("loopMode") == "repeat" and inside.sum() > 1:  # between copies a round earlier and later
+        times, values = times[inside], values[inside].repeat(3, 1)
+        times = torch.cat([times - frames, times, times + frames])
     index, share = segments(times, at)
     after = (index + 1).clamp(max=len(times) - 1)
-    if track.holds:
+    if track.fields.get("interpolation") == "step":
         values = values[index]
     else:
         rates = values.diff(dim=0) / times.diff()[:, None]
         ends = torch.cat([rates[:1], rates, rates[-1:]]) if len(rates) else torch.zeros(2, values.shape[1])
-        slopes = track.smoothness * (ends[1:] + ends[:-1]) / 2
+        slopes = smoothness * (ends[1:] + ends[:-1]) / 2
         width = (times[after] - times[index])[:, None]
         values = hermite(values[index], slopes[index] * width, slopes[after] * width, values[after], share)
     eyes, targets, angles = values[:, :3] * WORLD, values[:, 3:6] * WORLD, values[:, 6]
@@ -73,38 +68,18 @@ def path_of(path: Path) -> CameraPath:
     except UsageError as error:
         raise about.place.error(f"position and target: {error}") from error
     tangents = torch.tan(torch.deg2rad(angles) / 2)
-    return CameraPath(cameras_of(torch.linalg.inv(poses), tangents, max, about.place), track.fps, unsized=True)
+    return CameraPath(cameras_of(torch.linalg.inv(poses), tangents, max, about.place), fps, unsized=True)
 
 
-def _track(about: Entry) -> Track:
-    version = about.fields.get("version", 1)
-    about.place.expect(version in (1, 2), "version", "1 or 2", version)
-    [track, *_] = entries(about.place.file, "track", about.fields["animTracks"])
-    keys = track.entry("keyframes")
+def _keys(about: Entry, keys: Entry) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 7"]]:
+    """Times of the keys, and their position, target and fov."""
     times, values = keys.value("times"), keys.entry("values")
     keys.place.expect(isinstance(times, list) and len(times) > 0, "times", "a list of numbers", times)
-    n, fps = len(times), track.get("frameRate", number, FPS)
-    track.place.expect(fps > 0, "frameRate", "above 0", fps)
+    n = len(times)
     if "fov" in values:
         angles = numbers(values.value("fov"), n, values.place, "fov")
     else:
         angles = [about.entry("camera").get("fov", number, FOV) if "camera" in about else FOV] * n
-    frames = torch.tensor(numbers(times, n, keys.place, "times"), dtype=torch.float64)
-    places = [values.vector(key, 3 * n).view(n, 3) for key in ("position", "target")]
-    return Track(
-        frames * (1 if "frameRate" in track else fps),  # early files count times in s
-        torch.cat([*places, torch.tensor(angles, dtype=torch.float64)[:, None]], dim=1),
-        track.get("duration", number) * fps,
-        fps,
-        track.get("smoothness", number, 0.0),
-        track.fields.get("loopMode") == "repeat",
-        track.fields.get("interpolation") == "step",
-    )
-
-
-def _looped(track: Track) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 7"]]:
-    """The keys between copies of them a round earlier and a round later."""
-    inside = track.times < track.frames
-    times, values = track.times[inside], track.values[inside]
-    rounds = torch.cat([times - track.frames, times, times + track.frames])
-    return (rounds, values.repeat(3, 1)) if len(times) > 1 else (track.times, track.values)
+    columns = [values.vector(key, 3 * n).view(n, 3) for key in ("position", "target")]
+    columns.append(torch.tensor(angles, dtype=torch.float64)[:, None])
+    return keys.vector("times", n), torch.cat(columns, dim=1)

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.gltf import natural
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
@@ -23,7 +22,7 @@ from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import rows_of
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.values import Entry, Place, object_of, parse_json, read_bounded, read_start, text
+from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
 from aaplug.system.errors import FormatError, counted
 
 HEAD_BYTES = 64  # of a chunk, which tell its format

@@ -27,7 +27,7 @@ from aaplug.io.scenes.packed import MAX_BYTE, byte_opacities, floats, largest_la
 from aaplug.io.scenes.rows import check_count, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
-from aaplug.io.values import Entry, entries, object_of, read_bounded, read_json, text, whole
+from aaplug.io.values import Entry, entries, natural, object_of, read_bounded, read_json, text
 from aaplug.system.errors import FormatError
 
 FIELDS = [("means", "<f4", 3), ("rgba", "u1", 4), ("scales", "<u2", 3), ("quats", "<u4"), ("normals", "<u2", 3)]
@@ -91,7 +91,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """The finest level, and the environment if there is one; see `SceneFormat`."""
     with library_errors(path):
         root = object_of(read_json(path), path, name, "totalLevel and attributes", "attributes")
-        kind, levels = root.get("fileType", text), root.get("totalLevel", partial(whole, most=MAX_LEVELS))
+        kind, levels = root.get("fileType", text), root.get("totalLevel", partial(natural, most=MAX_LEVELS, least=1))
         root.place.expect(kind in KINDS, "fileType", " or ".join(KINDS), kind)
         degree, attributes = KINDS[kind], entries(path, "attribute", root.value("attributes"))
         beside = {file.name.lower(): file for file in path.parent.iterdir()}

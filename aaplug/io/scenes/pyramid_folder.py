@@ -25,7 +25,7 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.values import entries, number, object_of, read_json, text, whole
+from aaplug.io.values import entries, natural, number, object_of, read_json, text
 from aaplug.system.errors import FormatError
 
 MANIFEST = "lod.json"
@@ -103,7 +103,7 @@ def read_manifest(folder: str | PathLike[str], unfinished: bool = False) -> Mani
         counts = isinstance(chunks, list) and all(type(n) is int and 0 <= n <= MAX_GAUSSIANS for n in chunks)
         entry.place.expect(counts and bool(chunks), "chunks", "a list of counts", chunks)
         levels.append(LevelFile(file, rate, entry.get("hash", text), tuple(chunks)))
-    largest, count = (whole(about.value(key), about.place, key, MAX_GAUSSIANS) for key in ("largest", "count"))
+    largest, count = (natural(about.value(key), about.place, key, MAX_GAUSSIANS, 1) for key in ("largest", "count"))
     if len(levels) < count and not unfinished:
         remedy = "`aaplug lod --resume` makes the others, `--overwrite` all of them again"
         raise FormatError(path, f"lists {len(levels)} of {count} levels, as making them was interrupted; {remedy}")
