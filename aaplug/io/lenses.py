@@ -49,35 +49,29 @@ def cameras_of_photographs(
     Raises:
         UsageError: a panorama is to be undistorted.
     """
-    if not undistort:
-        bent = []
-        for camera, distortion in zip(cameras, distortions, strict=True):
-            if distortion is not None:
-                camera = replace(camera, **({"lens": distortion.lens} if distortion.lens else {"photo": None}))
-            bent.append(camera)
-        return bent
-    pinholes = []
+    drawn = []
     for camera, distortion in zip(cameras, distortions, strict=True):
-        if distortion is None:
-            pinholes.append(camera)
-            continue
-        if distortion.lens == EQUIRECT:
+        if distortion is not None and not undistort:
+            camera = replace(camera, **({"lens": distortion.lens} if distortion.lens else {"photo": None}))
+        elif distortion is not None and distortion.lens == EQUIRECT:
             problem = f"its photograph is a panorama ({distortion.name}), which no pinhole shows"
             raise UsageError(f"camera {camera.name}", f"{problem}; leave out `undistort`")
-        whole = window = None
-        if camera.photo is not None and distortion.lens is not None:
-            size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
-            whole = Undistortion(distortion.lens, size, pinhole, (0, 0, *size))
-            window = _window(whole)
-        if whole is None or window is None:
-            pinholes.append(replace(camera, photo=None))
-            continue
-        left, top, width, height = window
-        centre = {"cx": camera.cx - left, "cy": camera.cy - top}
-        pinholes.append(
-            replace(camera, width=width, height=height, **centre, undistortion=replace(whole, window=window))
-        )
-    return pinholes
+        elif distortion is not None:
+            camera = _straightened(camera, distortion.lens)
+        drawn.append(camera)
+    return drawn
+
+
+def _straightened(camera: Camera, lens: Lens | None) -> Camera:
+    """The pinhole of a camera whose photograph was taken by a lens, without it if it cannot be used."""
+    if camera.photo is not None and lens is not None:
+        size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
+        whole = Undistortion(lens, size, pinhole, (0, 0, *size))
+        if window := _window(whole):
+            left, top, width, height = window
+            placed = {"width": width, "height": height, "cx": camera.cx - left, "cy": camera.cy - top}
+            return replace(camera, **placed, undistortion=replace(whole, window=window))
+    return replace(camera, photo=None)
 
 
 def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None) -> Float[Tensor, "H W c"]:

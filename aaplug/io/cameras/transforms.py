@@ -45,6 +45,8 @@ PNG_COLOUR_TYPE = 25  # byte of the header
 PNG_ALPHA = (b"\4", b"\6")  # colour types with alpha: gray and RGB
 DATAPARSER = "dataparser_transforms.json"
 
+Dataparser = tuple[Float[Tensor, "4 4"], float]  # a rigid motion, followed by a scale
+
 name = "transforms"
 sign = "transforms.json (nerfstudio, instant-ngp)"
 
@@ -56,14 +58,6 @@ class Source:
     cameras: tuple[Camera, ...]
     held_out: tuple[bool, ...] | None = None
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Dataparser:
-    """A rigid motion, followed by a scale."""
-
-    motion: Float[Tensor, "4 4"]
-    scale: float
 
 
 def sniff(path: Path) -> bool:
@@ -124,7 +118,7 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     if exported:
         notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
     elif parser:
-        notes.append(f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains")
+        notes.append(f"frame: that of {DATAPARSER} (scale {parser[1]:g}), in which nerfstudio trains")
     elif "applied_transform" in document:
         notes.append(f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it")
     return Source(tuple(cameras), _held_out(file, document, paths), tuple(notes))
@@ -156,7 +150,7 @@ def _dataparser(path: Path) -> Dataparser | None:
     entry = object_of(read_json(path), path, "it", "transform and scale")
     matrix, scale = entry.matrix("transform", 3, 4), entry.get("scale", number)
     entry.place.expect(scale > 0, "scale", "above 0", scale)
-    return Dataparser(pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale)
+    return pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale
 
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
@@ -183,8 +177,8 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
     fx, fy, cx, cy = _intrinsics(entry, width, height)
     world_from_cam = pose_of_opengl(rigid(entry, "transform_matrix"), entry.place, "transform_matrix")
     if parser is not None:
-        world_from_cam = parser.motion @ world_from_cam
-        world_from_cam[:3, 3] *= parser.scale
+        world_from_cam = parser[0] @ world_from_cam
+        world_from_cam[:3, 3] *= parser[1]
     cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
     return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 

@@ -36,7 +36,7 @@ def sniff(path: Path) -> bool:
 def path_of(path: Path) -> CameraPath:
     """The camera at each time code, or at rest as a path of one frame."""
     try:
-        Tf = _module("Tf")
+        Tf = module("Tf")
     except ImportError as error:
         raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}") from error
     try:
@@ -46,7 +46,7 @@ def path_of(path: Path) -> CameraPath:
 
 
 def _read(path: Path) -> CameraPath:
-    Usd, UsdGeom = _module("Usd"), _module("UsdGeom")
+    Usd, UsdGeom = module("Usd"), module("UsdGeom")
     _check_layers(path)
     stage = Usd.Stage.Open(str(path))
     found = [UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
@@ -69,14 +69,14 @@ def _read(path: Path) -> CameraPath:
     return CameraPath(named, fps, cameras[0][1])
 
 
-def _module(name: str) -> Any:
+def module(name: str) -> Any:
     """A module of the package `usd-core`, whose stubs are not complete."""
     return import_module(f"pxr.{name}")
 
 
 def _check_layers(path: Path) -> None:
     """Refuse layers outside of the file's folder, whoever names them."""
-    Sdf, home, left, seen = _module("Sdf"), path.parent.resolve(), [str(path)], set[str]()
+    Sdf, home, left, seen = module("Sdf"), path.parent.resolve(), [str(path)], set[str]()
     while left:
         layer = Sdf.Layer.FindOrOpen(left.pop())
         if layer is None:
@@ -95,7 +95,7 @@ def _check_layers(path: Path) -> None:
 
 def _moves(camera: Any) -> bool:
     """Whether the camera, or a prim above it, has time samples."""
-    UsdGeom, prim = _module("UsdGeom"), camera.GetPrim()
+    UsdGeom, prim = module("UsdGeom"), camera.GetPrim()
     own = any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAttributes())
     while prim and not own:
         own = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if prim.IsA(UsdGeom.Xformable) else False

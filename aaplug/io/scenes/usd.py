@@ -15,7 +15,6 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from torch import Tensor
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file
+from aaplug.io.cameras.usd import module
 from aaplug.io.scenes.columns import logit_of
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
@@ -105,11 +105,6 @@ class UsdFormat:
 
 
 FORMATS = tuple(UsdFormat(suffix) for suffix in SUFFIXES)
-
-
-def module(name: str) -> Any:
-    """A module of usd-core, whose stubs are not complete."""
-    return import_module(f"{PACKAGE}.{name}")
 
 
 def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
