@@ -11,8 +11,8 @@ of ours in the primitive's `extras`.
 """
 
 import json
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -33,7 +33,7 @@ from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, replacing_group
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.values import Entry, Place
+from aaplug.io.values import Entry
 from aaplug.system.errors import FormatError, OutputError
 
 SPLATS, SPZ = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
@@ -46,8 +46,6 @@ MOST_DEGREE = 3
 MOST_BYTES = 2**32 - 1  # of a .glb, whose size is 32 bits
 ROOM = 8192  # bytes of JSON, padded so that the smallest and largest position can be filled in at the end
 EVIDENCE = "glTF does not say: assumed classic (3DGS default)"
-
-Rows = Callable[[int, int], Gaussians]
 
 
 def harmonics(degree: int) -> list[str]:
@@ -86,7 +84,7 @@ class GltfFormat:
         count, degree = sum(part.count for part in parts), max(part.degree for part in parts)
         check_count(path, count)
         notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
-        load, others = partial(rows_of, parts, degree), tuple(document.files)
+        load, others = partial(rows_of, [(part.count, part.load) for part in parts], degree), tuple(document.files)
         said = {"convention": facts.convention, "fused": facts.fused, "others": others}
         return Scene(path, self.name, count, degree, load, facts.evidence, notes=tuple(filter(None, notes)), **said)
 
@@ -113,12 +111,11 @@ class GltfFormat:
                 for at, values in document.placed(part):
                     data[at : at + len(values)] = values
             name = f"{path.stem}.bin"
-            whole = partial(_gltf, document)
-            replacing_group(path, {name: bytes(data)}, lambda names: whole(names[name]), overwrite)
 
+            def whole(names: Mapping[str, str]) -> bytes:
+                return json.dumps(document.json(uri=names[name]), separators=(",", ":")).encode()
 
-def _gltf(document: "_Document", uri: str) -> bytes:
-    return json.dumps(document.json(uri=uri), separators=(",", ":")).encode()
+            replacing_group(path, {name: bytes(data)}, whole, overwrite)
 
 
 FORMATS = (GltfFormat("spz.glb"), GltfFormat("glb"), GltfFormat("gltf"))
@@ -133,7 +130,7 @@ class Primitive:
 
     count: int
     degree: int
-    load: Rows
+    load: Callable[[int, int], Gaussians]
     extras: dict[str, Any]
     note: str = ""
 
@@ -157,12 +154,11 @@ def _primitives(document: Gltf) -> list[Primitive]:
             primitive = Entry(mesh.place, fields)
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
             if SPLATS in extensions:
-                part = _primitive(document, primitive, extensions.entry(SPLATS))
-                found.append(replace(part, load=partial(_standing, part.load, motion, mesh.place)))
+                found.append(_primitive(document, primitive, extensions.entry(SPLATS), motion))
     return found
 
 
-def _primitive(document: Gltf, primitive: Entry, splats: Entry) -> Primitive:
+def _primitive(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Tensor, "4 4"]) -> Primitive:
     place = primitive.place
     place.expect(primitive.fields.get("mode") == POINTS, "mode", "0 (points)", primitive.fields.get("mode"))
     kernel, colours = splats.fields.get("kernel", "ellipse"), splats.fields.get("colorSpace")
@@ -172,22 +168,19 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry) -> Primitive:
     inner = splats.entry("extensions") if "extensions" in splats else splats
     if SPZ in inner:
         view, _ = document.view(inner.entry(SPZ))
-        file = spz.parsed(document.path, view.read(0, view.size))
-        load = partial(spz.rows, file.header, file.sections, spz.TURNS["opencv"])
-        return Primitive(file.header.count, file.header.degree, load, extras, note)
-    attributes = primitive.entry("attributes")
-    degree = max((d for d in range(MOST_DEGREE + 1) if harmonics(d)[-1] in attributes), default=0)
-    kinds = {"ROTATION": ("VEC4", SIGNED), "SCALE": ("VEC3", SIGNED), "OPACITY": ("SCALAR", UNSIGNED)}
-    tables = {key: document.accessor(attributes, PREFIX + key, *kind) for key, kind in kinds.items()}
-    tables["POSITION"] = document.accessor(attributes, "POSITION", "VEC3", tuple({*SIGNED, *UNSIGNED}))
-    tables |= {name: document.accessor(attributes, name, "VEC3") for name in harmonics(degree)}
-    counts = {table.count for table in tables.values()}
-    place.expect(len(counts) == 1, "attributes", "as many rows each", sorted(counts))
-    return Primitive(counts.pop(), degree, partial(_read, tables, degree), extras, note)
-
-
-def _standing(load: Rows, motion: Float[Tensor, "4 4"], place: Place, start: int, stop: int) -> Gaussians:
-    return standing(load(start, stop), motion, place)
+        header, sections, _ = spz.parsed(document.path, view.read(0, view.size))
+        count, degree, load = header.count, header.degree, partial(spz.rows, header, sections, spz.TURNS["opencv"])
+    else:
+        attributes = primitive.entry("attributes")
+        degree = max((d for d in range(MOST_DEGREE + 1) if harmonics(d)[-1] in attributes), default=0)
+        kinds = {"ROTATION": ("VEC4", SIGNED), "SCALE": ("VEC3", SIGNED), "OPACITY": ("SCALAR", UNSIGNED)}
+        tables = {key: document.accessor(attributes, PREFIX + key, *kind) for key, kind in kinds.items()}
+        tables["POSITION"] = document.accessor(attributes, "POSITION", "VEC3", tuple({*SIGNED, *UNSIGNED}))
+        tables |= {name: document.accessor(attributes, name, "VEC3") for name in harmonics(degree)}
+        counts = {table.count for table in tables.values()}
+        place.expect(len(counts) == 1, "attributes", "as many rows each", sorted(counts))
+        count, load = counts.pop(), partial(_read, tables, degree)
+    return Primitive(count, degree, lambda start, stop: standing(load(start, stop), motion, place), extras, note)
 
 
 def _read(tables: dict[str, Accessor], degree: int, start: int, stop: int) -> Gaussians:

@@ -7,11 +7,9 @@ data.bin.  A record is position (float32), colour and opacity (bytes), linear sc
 11 bits between their ends, and lie at twice the record's place.  z is up.  The format does not tell of training.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +21,7 @@ from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import sh_of_colour
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import MAX_BYTE, byte_opacities, floats, largest_last, rows_of
+from aaplug.io.scenes.packed import MAX_BYTE, Piece, byte_opacities, floats, largest_last, rows_of
 from aaplug.io.scenes.rows import check_count, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -43,43 +41,9 @@ MAX_LEVELS = 64
 Z_UP = torch.tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # to y down and z forward
 CREDIT = "Data Organization Format originated from XGRIDS"  # its license asks to show it
 
+Read = Callable[[int, int], np.ndarray]  # of the rows of a table from start up to stop
+
 name = "lcc"
-
-
-class Table(NamedTuple):
-    """Rows of a file; start: byte of the first."""
-
-    file: Path
-    dtype: np.dtype
-    start: int
-
-
-@dataclass(frozen=True)
-class Records:
-    """Gaussians of a part of space, or the environment.
-
-    scales, sh: ends.  harmonics, sh: None for degree 0.
-    """
-
-    count: int
-    table: Table
-    harmonics: Table | None
-    scales: Float[Tensor, "2 3"]
-    sh: Float[Tensor, "2 3"] | None = None
-
-    def load(self, start: int, stop: int) -> Gaussians:
-        """The rows from start up to stop, in the file's axes."""
-        rows = read_rows(self.table.file, self.table.dtype, start, stop, self.table.start)
-        words = rows["quats"][:, None] >> np.arange(4, dtype=np.uint32) * QUATERNION_BITS
-        rest = (floats(words[:, :3] & MOST_QUATERNION) / MOST_QUATERNION - 0.5) * 2**0.5
-        quats = largest_last(rest, torch.from_numpy(words[:, 3].astype(np.int64))).roll(1, dims=1)
-        scales = torch.lerp(self.scales[0], self.scales[1], floats(rows["scales"]) / MOST_SCALE)
-        sh = sh_of_colour(floats(rows["rgba"][:, :3]) / MAX_BYTE)[:, None]
-        if self.harmonics is not None and self.sh is not None:
-            packed = read_rows(self.harmonics.file, self.harmonics.dtype, start, stop, self.harmonics.start)["sh"]
-            values = floats((packed[:, :COEFFICIENTS, None] >> SHIFTS & MOST) / MOST)
-            sh = torch.cat([sh, torch.lerp(self.sh[0], self.sh[1], values)], dim=1)
-        return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -101,15 +65,15 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         index, data, *harmonics = (beside[each] for each in names)
         ends = partial(_ends, path, {each.get("name", text): each for each in attributes})
         kinds = ("scale", "shcoef") if degree else ("scale",)
-        pieces = _pieces(index, data, harmonics[0] if degree else None, levels, ends(kinds))
+        pieces = _pieces(index, data, harmonics[0] if degree else data, levels, ends(kinds))
         far = FAR_RECORD if degree else RECORD
         if (sky := beside.get("environment.bin")) and sky.stat().st_size:
             count, rest = divmod(sky.stat().st_size, far.itemsize)
             if rest:
                 raise FormatError(sky, f"has {sky.stat().st_size:,} bytes, not a multiple of {far.itemsize}")
-            table = Table(sky, far, 0)
-            pieces.append(Records(count, table, table if degree else None, *ends([f"env{kind}" for kind in kinds])))
-    count = sum(piece.count for piece in pieces)
+            read = partial(read_rows, sky, far)
+            pieces.append((count, partial(_load, read, read, ends([f"env{kind}" for kind in kinds]))))
+    count = sum(count for count, _ in pieces)
     check_count(path, count)
     used = tuple(beside[each] for each in (*names, "environment.bin") if each in beside)
     notes = (f"the finest of {levels} levels", CREDIT)
@@ -125,6 +89,21 @@ def turned_from_z_up(scene: Gaussians) -> Gaussians:
     return placed(scene, Z_UP, 1.0, (0.0, 0.0, 0.0))
 
 
+def _load(read: Read, read_harmonics: Read, ends: Sequence[Float[Tensor, "2 3"]], start: int, stop: int) -> Gaussians:
+    """The rows from start up to stop, in the file's axes.  ends: of scales, and of harmonics if there are any."""
+    rows = read(start, stop)
+    words = rows["quats"][:, None] >> np.arange(4, dtype=np.uint32) * QUATERNION_BITS
+    rest = (floats(words[:, :3] & MOST_QUATERNION) / MOST_QUATERNION - 0.5) * 2**0.5
+    quats = largest_last(rest, torch.from_numpy(words[:, 3].astype(np.int64))).roll(1, dims=1)
+    scales = torch.lerp(*ends[0], floats(rows["scales"]) / MOST_SCALE)
+    sh = sh_of_colour(floats(rows["rgba"][:, :3]) / MAX_BYTE)[:, None]
+    if len(ends) > 1:
+        packed = read_harmonics(start, stop)["sh"]
+        values = floats((packed[:, :COEFFICIENTS, None] >> SHIFTS & MOST) / MOST)
+        sh = torch.cat([sh, torch.lerp(*ends[1], values)], dim=1)
+    return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
+
+
 def _ends(path: Path, attributes: dict[str, Entry], wanted: Sequence[str]) -> list[Float[Tensor, "2 3"]]:
     if lacking := set(wanted) - set(attributes):
         raise FormatError(path, f"attributes: {min(lacking)} is missing")
@@ -132,7 +111,7 @@ def _ends(path: Path, attributes: dict[str, Entry], wanted: Sequence[str]) -> li
     return [torch.stack([each.vector("min", 3), each.vector("max", 3)]).float() for each in found]
 
 
-def _pieces(index: Path, data: Path, harmonics: Path | None, levels: int, ends: list[Tensor]) -> list[Records]:
+def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Tensor]) -> list[Piece]:
     """Records of the finest level, part of space by part."""
     entry = np.dtype([("part", "<u4"), ("levels", LEVEL, (levels,))])
     held = read_bounded(index, whole_limit("JSON"))
@@ -140,13 +119,16 @@ def _pieces(index: Path, data: Path, harmonics: Path | None, levels: int, ends: 
         raise FormatError(index, f"has {len(held):,} bytes, not a multiple of {entry.itemsize} for {levels} levels")
     finest = np.frombuffer(held, entry)["levels"][:, 0]
     size = data.stat().st_size
-    whole = size if harmonics is None else min(size, harmonics.stat().st_size // 2)
+    whole = min(size, harmonics.stat().st_size // 2) if len(ends) > 1 else size
     counts, starts, sizes = (finest[key].astype(np.uint64) for key in ("count", "start", "size"))
     wrong = (sizes != counts * RECORD.itemsize) | (starts > size) | (sizes > whole - np.minimum(starts, whole))
     if wrong.any() or sizes.sum() > size:
         raise FormatError(index, f"part {int(wrong.argmax())} should lie in {data.name}, of {whole:,} bytes")
-    found = list[Records]()
+    found = list[Piece]()
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-        table = Table(data, RECORD, start)
-        found.append(Records(count, table, harmonics and Table(harmonics, HARMONICS, 2 * start), *ends))
+        reads = (
+            partial(read_rows, data, RECORD, offset=start),
+            partial(read_rows, harmonics, HARMONICS, offset=2 * start),
+        )
+        found.append((count, partial(_load, *reads, ends)))
     return found

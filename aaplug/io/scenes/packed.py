@@ -12,7 +12,6 @@ from functools import partial
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -30,6 +29,7 @@ from aaplug.system.errors import FormatError
 MAX_BYTE = 255
 HASH_DIGITS = 8  # in the name of a file that another one names
 UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
+Piece = tuple[int, Callable[[int, int], Gaussians]]  # of a scene: how many rows, what reads those from start up to stop
 half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
 half_turn_about_x = partial(mirrored, signs=(1.0, -1.0, -1.0))  # from OpenGL's axes to OpenCV's, and back
 
@@ -130,22 +130,12 @@ def of_degree(scene: Gaussians, degree: int) -> Gaussians:
     return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))
 
 
-@runtime_checkable
-class Piece(Protocol):
-    """Some of a scene's rows: how many, and what reads those from start up to stop."""
-
-    @property
-    def count(self) -> int: ...  # noqa: D102
-
-    def load(self, start: int, stop: int, /) -> Gaussians: ...  # noqa: D102
-
-
 def rows_of(pieces: Sequence[Piece], degree: int, start: int, stop: int) -> Gaussians:
     """The rows from start up to stop of pieces in a row, with harmonics up to this degree."""
     read, first = list[Gaussians](), 0
-    for piece in pieces:
-        begin, end = max(start - first, 0), min(stop - first, piece.count)
+    for count, load in pieces:
+        begin, end = max(start - first, 0), min(stop - first, count)
         if begin < end or (start == stop and not read):
-            read.append(of_degree(piece.load(begin, max(begin, end)), degree))
-        first += piece.count
+            read.append(of_degree(load(begin, max(begin, end)), degree))
+        first += count
     return joined(read)

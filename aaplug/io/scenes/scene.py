@@ -5,6 +5,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -12,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.conventions import CLASSIC, MIP, Convention
@@ -23,7 +22,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of
+from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
 from aaplug.io.scenes.rows import library_errors
 from aaplug.system.contracts import contract
 from aaplug.system.digests import digest_of_values
@@ -211,17 +210,21 @@ class Scene:
             FormatError: a row cannot be used, and neither `drop_bad` nor `faults` asks to leave it out.
         """
         dropped: dict[str, int] = {} if faults is None else faults
-        left_out, doubts = 0, dict[str, int]()
+        left_out, doubts = 0, Counter[str]()
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
             if self.path is None:
                 yield part
                 continue
-            bad = _check(part, self.path, self.drop_bad or faults is not None, dropped)
-            left_out += 0 if bad is None else int(bad.sum())
-            part = part if bad is None else part[~bad]
-            for text, number in doubts_of(part).items():
-                doubts[text] = doubts.get(text, 0) + number
+            if found := faults_of(part):
+                if faults is None and not self.drop_bad:
+                    what = described_faults(found, start)
+                    raise FormatError(self.path, f"{what}; pass `drop_bad` to leave such rows out")
+                for text, rows in found.items():
+                    dropped[text] = dropped.get(text, 0) + int(rows.sum())
+                good = usable(part)
+                left_out, part = left_out + len(part) - len(good), good
+            doubts.update(doubts_of(part))
             yield part
         for text, number in doubts.items():
             log.warning("%s: %d of %d Gaussians have %s", self.name, number, self.count, text)
@@ -311,20 +314,6 @@ class _Rows:
 
     def __call__(self, start: int, stop: int) -> Gaussians:
         return self.rows[start:stop]
-
-
-def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int]) -> Bool[Tensor, " n"] | None:
-    """A mask of unusable rows, None if there are none; counts them by fault in `dropped`."""
-    faults = faults_of(part)
-    if not faults:
-        return None
-    assert part.origin is not None
-    if not drop_bad:
-        what = described_faults(faults, int(part.origin.rows[0]))
-        raise FormatError(path, f"{what}; pass `drop_bad` to leave such rows out")
-    for text, rows in faults.items():
-        dropped[text] = dropped.get(text, 0) + int(rows.sum())
-    return torch.stack(list(faults.values())).any(dim=0)
 
 
 def probes(count: int, each: int) -> list[range]:

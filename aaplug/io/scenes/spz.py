@@ -108,8 +108,7 @@ def sniff(path: Path, head: bytes) -> bool:
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
-        file = parsed(path, path.read_bytes())
-    header, sections, axes = file.header, file.sections, file.axes
+        header, sections, axes = parsed(path, path.read_bytes())
     convention, evidence = CLASSIC, "the flag antialiased is not set: assumed classic"
     if header.flags & ANTIALIASED_FLAG:
         convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
@@ -126,17 +125,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     return reading(TURNS["opengl"], AXES_NOTES["opengl"], reading(TURNS["opencv"], AXES_NOTES["opencv"]))
 
 
-@dataclass(frozen=True)
-class Parsed:
-    """A file's header, its sections with a row per Gaussian, and the axes that it states."""
-
-    header: Header
-    sections: list[np.ndarray]
-    axes: str | None
-
-
-def parsed(path: Path, data: bytes) -> Parsed:
-    """The content of a file, or of a part of the file `path`."""
+def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | None]:
+    """A file's header, its sections with a row per Gaussian, and the axes that it states; or those of a part of it."""
     zipped = data.startswith(GZIP_SIGNATURE)
     header = _header(
         path, zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
@@ -152,7 +142,7 @@ def parsed(path: Path, data: bytes) -> Parsed:
         records = payload[sum(sizes) :]
     shaped = zip(parts, header.widths, strict=True)
     sections = [np.frombuffer(part, np.uint8).reshape(header.count, width) for part, width in shaped]
-    return Parsed(header, sections, _axes(path, records) if header.flags & EXTENSIONS_FLAG else None)
+    return header, sections, _axes(path, records) if header.flags & EXTENSIONS_FLAG else None
 
 
 def _axes(path: Path, records: bytes) -> str | None:
@@ -198,7 +188,7 @@ def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
     return data[HEADER.size :]
 
 
-def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[Iterable[bytes], bytes]:
+def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
     """The sections of version 4, and the records before them; an empty section has no stream."""
     if len(data) < HEADER_4.size:
         raise FormatError(path, "is cut short in its header")
@@ -209,15 +199,10 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[Iterable[bytes]
         what = f"has {number} streams listed at byte {table:,}"
         raise FormatError(path, f"{what}; {wanted} and a place within the file expected")
     check_growth(path, sum(sizes), len(data))
-    return _inflated(path, data, sizes, table, at), data[HEADER_4.size : table]
-
-
-def _inflated(path: Path, data: bytes, sizes: list[int], table: int, at: int) -> Iterable[bytes]:
-    number = sum(size > 0 for size in sizes)
-    listed = iter(STREAM.unpack_from(data, table + i * STREAM.size) for i in range(number))
+    sections, listed = list[bytes](), STREAM.iter_unpack(data[table:at])
     for size in sizes:
         if not size:
-            yield b""
+            sections.append(b"")
             continue
         compressed, inflated = next(listed)
         if inflated != size or at + compressed > len(data):
@@ -228,8 +213,9 @@ def _inflated(path: Path, data: bytes, sizes: list[int], table: int, at: int) ->
             section = stream.read(size + 1)
         if len(section) != size:
             raise FormatError(path, f"a stream inflates to {len(section):,} bytes where {size:,} are promised")
-        yield section
+        sections.append(section)
         at += compressed
+    return sections, data[HEADER_4.size : table]
 
 
 def rows(
