@@ -26,8 +26,8 @@ from aaplug.io.scenes import (
     usd,
     write_scene,
 )
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError

@@ -11,9 +11,8 @@ from plyfile import PlyData
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.images import read_image
-from aaplug.io.scenes import harmonics, read_scene, write_scene
-from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes.scene import Scene, without_harmonics
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
@@ -37,7 +36,7 @@ def written(folder: Path, count: int = 3000) -> tuple[Path, Gaussians]:
 @pytest.fixture
 def in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Harmonics of any size stay in the file, and Gaussians are projected in chunks."""
-    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    monkeypatch.setattr("aaplug.io.scenes.scene.MAX_HARMONICS_BYTES", 0)
     monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 700)
 
 
@@ -89,7 +88,7 @@ def test_another_process_reads_the_file_itself(tmp_path: Path):
 
 
 def test_gaussians_that_were_read_anyway_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    monkeypatch.setattr("aaplug.io.scenes.scene.MAX_HARMONICS_BYTES", 0)
     scene = read_scene(written(tmp_path)[0])
     assert without_harmonics(scene) is without_harmonics(scene), "it is read once"
     scene.gaussians()
@@ -102,7 +101,7 @@ def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.
         return [read_image(file) for _, file in render(chair, sample_folder, tmp_path / folder, **one)]
 
     expected = images("held")
-    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    monkeypatch.setattr("aaplug.io.scenes.scene.MAX_HARMONICS_BYTES", 0)
     monkeypatch.setattr(Scene, "gaussians", lambda scene: pytest.fail("all of the scene is read"))
     assert all(torch.equal(a, b) for a, b in zip(images("read"), expected, strict=True))
 
@@ -110,9 +109,9 @@ def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.
 MADE = """
 from pathlib import Path
 from aaplug.evaluation.laws.base import make_scene
-from aaplug.io.scenes import harmonics, ply, read_scene, write_scene
-from aaplug.io.scenes.harmonics import without_harmonics
-harmonics.MAX_HARMONICS_BYTES = 0
+from aaplug.io.scenes import ply, read_scene, scene, write_scene
+from aaplug.io.scenes.scene import without_harmonics
+scene.MAX_HARMONICS_BYTES = 0
 ply.ROWS_PER_PART = 5_000
 path = Path({path!r})
 without_harmonics(read_scene(path))

@@ -23,8 +23,7 @@ from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
-from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes.scene import Scene, without_harmonics
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.recipe import Recipe

@@ -39,8 +39,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import colour_of
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
-from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene import Scene, SceneFrames
+from aaplug.io.scenes.scene import Scene, SceneFrames, without_harmonics
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.order import Order, Shown

@@ -10,7 +10,7 @@ from aaplug.core.imaging import quantised
 from aaplug.evaluation.metric import Metric
 from aaplug.io.cameras import CameraFormat
 from aaplug.io.scenes import SCENE_FORMATS, SceneFormat, WritableFormat
-from aaplug.io.scenes.options import SceneFileOptions
+from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.locks import OUR_PREFIX
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -23,10 +24,8 @@ from aaplug.io import STREAM_INDEXES
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.faults import described_faults, faults_of
-from aaplug.io.scenes.frames import frame_files
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.rows import library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
@@ -37,6 +36,7 @@ from aaplug.system.registry import Registry, named
 log = logging.getLogger("aaplug")
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
+NUMBERED = re.compile(r"(.*?)(?<!\d)(?<!_lod)(\d+)((?:\.compressed)?\.ply)", re.ASCII)  # levels of detail are no frames
 
 
 @runtime_checkable
@@ -285,3 +285,26 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
+
+
+def frame_files(folder: Path) -> dict[Path, str]:
+    """The numbers of the files of a scene in time, by file and in order; none if no two differ by a number alone.
+
+    Raises FormatError where frames are missing or there twice, or of several sequences.
+    """
+    matches = [match for path in folder.glob("*.ply") if (match := NUMBERED.fullmatch(path.name))]
+    named: dict[tuple[str, str], list[re.Match[str]]] = {}
+    for match in sorted(matches, key=lambda match: (int(match[2]), match[0])):
+        named.setdefault((match[1], match[3]), []).append(match)
+    sequences = {name: found for name, found in named.items() if len(found) > 1}
+    if not sequences:
+        return {}
+    if len(sequences) > 1:
+        patterns = listing(sorted(f"{first}####{last}" for first, last in sequences))
+        raise FormatError(folder, f"holds frames of {len(sequences)} sequences ({patterns}); give each a folder")
+    [found] = sequences.values()
+    for before, after in pairwise(found):
+        if int(after[2]) != (expected := int(before[2]) + 1):
+            problem = f"expected frame {expected} after {before[0]}, got {after[0]}"
+            raise FormatError(folder, f"{problem}; or name one of the files")
+    return {folder.absolute() / match[0]: match[2] for match in found}

@@ -19,13 +19,12 @@ from torch import Tensor
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import DEGREES, sh_of_colour
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_last, without_largest
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.record import warn_of_moves, whole
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
 

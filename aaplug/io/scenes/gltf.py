@@ -28,10 +28,9 @@ from aaplug.io.atomic import replacing
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.columns import logit_of
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry
 from aaplug.system.errors import FormatError, OutputError

@@ -15,9 +15,8 @@ import torch
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.scenes.columns import sh_of_colour
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.system.errors import FormatError

@@ -20,9 +20,8 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import sh_of_colour
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import MAX_BYTE, Piece, byte_opacities, floats, largest_last, rows_of
-from aaplug.io.scenes.rows import check_count, library_errors, read_rows
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.io.values import Entry, entries, natural, object_of, read_bounded, read_json, text
@@ -126,9 +125,7 @@ def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Te
         raise FormatError(index, f"part {int(wrong.argmax())} should lie in {data.name}, of {whole:,} bytes")
     found = list[Piece]()
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-        reads = (
-            partial(read_rows, data, RECORD, offset=start),
-            partial(read_rows, harmonics, HARMONICS, offset=2 * start),
-        )
-        found.append((count, partial(_load, *reads, ends)))
+        read = partial(read_rows, data, RECORD, offset=start)
+        read_harmonics = partial(read_rows, harmonics, HARMONICS, offset=2 * start)
+        found.append((count, partial(_load, read, read_harmonics, ends)))
     return found

@@ -20,11 +20,10 @@ import torch
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of, sh_of_colour
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError, counted, listing
 

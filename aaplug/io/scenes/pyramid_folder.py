@@ -24,7 +24,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes import ply
-from aaplug.io.scenes.options import SceneFileOptions
+from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.values import entries, natural, number, object_of, read_json, text
 from aaplug.system.errors import FormatError
 

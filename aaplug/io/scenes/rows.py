@@ -1,16 +1,39 @@
-"""What every format needs to read rows: the errors of libraries as ours, rows of a table, the limit of a scene."""
+"""What every scene format needs: its options, errors of libraries as ours, rows of a table, the limit of a scene."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from aaplug.core.conventions import SpzAxes, SpzVersion
 from aaplug.io.limits import whole_limit
-from aaplug.system.contracts import contract
+from aaplug.system.contracts import check_fields, contract
 from aaplug.system.errors import AaplugError, FormatError, reason
 
 MAX_REASON = 200  # characters of a library's message
+
+
+@dataclass(frozen=True)
+class SceneFileOptions:
+    """The user's choices for reading and writing, of which each format uses those that concern it.
+
+    allow_checkpoint: open a .pt, a pickle, of which only tensors are read.
+    spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write,
+        or "auto": written by the specification, and read as the file says, or else as fits the cameras.
+    spz_version: of a .spz to write.
+
+    Raises:
+        UsageError: there are no such axes, or no such version.
+    """
+
+    allow_checkpoint: bool = False
+    spz_axes: SpzAxes = "auto"
+    spz_version: SpzVersion = 4
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @contract

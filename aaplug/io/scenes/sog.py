@@ -31,7 +31,6 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.codebooks import codebook, nearest_value, palette
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import (
     MAX_BYTE,
     byte_opacities,
@@ -43,7 +42,7 @@ from aaplug.io.scenes.packed import (
     without_largest,
 )
 from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError

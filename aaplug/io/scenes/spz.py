@@ -31,7 +31,6 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import (
     byte_opacities,
     bytes_of,
@@ -42,7 +41,7 @@ from aaplug.io.scenes.packed import (
     without_largest,
 )
 from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
 

@@ -28,10 +28,9 @@ from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file
 from aaplug.io.cameras.usd import module
 from aaplug.io.scenes.columns import logit_of
-from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, entries, object_of, parse_json, text
 from aaplug.system.errors import FormatError, OutputError, UsageError
