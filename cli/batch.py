@@ -137,9 +137,9 @@ def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:
     """The scenes of a batch file with their options; `base` has what the file does not say."""
     from aaplug.io.batch_file import read_batch
 
-    file, refused = read_batch(path), (*NOT_IN_A_FILE, *ONCE)
-    shared = _set(path, "at the top", base, file.shared, NOT_IN_A_FILE)
-    return [(name, _set(path, f"scene '{name}'", shared, settings, refused)) for name, settings in file.scenes.items()]
+    (at_the_top, scenes), refused = read_batch(path), (*NOT_IN_A_FILE, *ONCE)
+    shared = _set(path, "at the top", base, at_the_top, NOT_IN_A_FILE)
+    return [(name, _set(path, f"scene '{name}'", shared, settings, refused)) for name, settings in scenes.items()]
 
 
 def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refused: Sequence[str]) -> Words:

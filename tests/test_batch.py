@@ -190,10 +190,10 @@ def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, case):
 def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
     path = tmp_path / "b.toml"
     path.write_text("cull_margin = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8")
-    file = read_batch(path)
-    assert file.shared == {"cull_margin": 0.3}
+    shared, scenes = read_batch(path)
+    assert shared == {"cull_margin": 0.3}
     expected = {"scene": str(tmp_path / "x/a.ply"), "cameras": "/abs", "test_every": 8}
-    assert file.scenes == {"a": expected}
+    assert scenes == {"a": expected}
 
 
 def test_a_file_can_take_back_what_the_command_line_sets(batch):

@@ -118,12 +118,13 @@ def information_by_loop(mean: list[float], cameras: list[Camera]) -> list[list[f
     [(torch.float64, 0.0, 1e-12), (torch.float32, 0.0, 1e-6), (torch.float64, 1.0, 1e-8)],
     ids=["float64", "float32", "far from the origin"],
 )
-def test_view_information_agrees_with_a_loop_in_float64(dtype, offset, tolerance):
+def test_view_information_agrees_with_a_loop_in_float64(dtype, offset, tolerance, monkeypatch):
+    monkeypatch.setattr("aaplug.core.sampling.CHUNK_PAIRS", 20)
     cameras = [moved(camera, offset * FAR) for camera in ring()]
     means = make_scene(30, dtype=torch.float64).means
     means[3] = torch.tensor([0.0, 0.0, 500.0])
     means = (means + offset * FAR).to(dtype)
-    information = view_information(means, cameras, chunk_pairs=20)
+    information = view_information(means, cameras)
     rows = [information_by_loop(mean, cameras) for mean in means.tolist()]
     expected = torch.tensor(rows, dtype=torch.float64)
     assert information.dtype == dtype
@@ -132,9 +133,11 @@ def test_view_information_agrees_with_a_loop_in_float64(dtype, offset, tolerance
 
 
 @pytest.mark.parametrize("chunk_pairs", [1, 7, 64, 350, 10**9])
-def test_the_size_of_chunks_changes_nothing(chunk_pairs):
+def test_the_size_of_chunks_changes_nothing(chunk_pairs, monkeypatch):
     means, cameras = make_scene(50).means * 2, ring()
-    whole, parts = sampling_bounds(means, cameras), sampling_bounds(means, cameras, chunk_pairs)
+    whole = sampling_bounds(means, cameras)
+    monkeypatch.setattr("aaplug.core.sampling.CHUNK_PAIRS", chunk_pairs)
+    parts = sampling_bounds(means, cameras)
     torch.testing.assert_close(parts.highest, whole.highest, rtol=1e-6, atol=0)
     torch.testing.assert_close(parts.lowest, whole.lowest, rtol=1e-6, atol=0)
     assert parts.views.equal(whole.views)
@@ -183,14 +186,16 @@ def test_the_frame_check_samples_a_large_scene_evenly():
 
 
 BOUNDS = """
-from aaplug.core.sampling import CHUNK_PAIRS, sampling_bounds
+from aaplug.core import sampling
+from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.laws.base import make_camera
 means, cameras = torch.randn(100_000, 3), [make_camera((0.0, -4.0 - i / 50, 0.0)) for i in range(60)]
+sampling.CHUNK_PAIRS //= 10
 sampling_bounds(means[:100], cameras)
 """
 
 
 @needs_peak_memory
 def test_memory_does_not_grow_with_gaussians_times_cameras():
-    [taken] = memory_taken(BOUNDS, "sampling_bounds(means, cameras, CHUNK_PAIRS // 10)")
+    [taken] = memory_taken(BOUNDS, "sampling_bounds(means, cameras)")
     assert taken < MEMORY_LIMIT

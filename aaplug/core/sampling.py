@@ -76,17 +76,15 @@ class SamplingBounds:
 
 @torch.no_grad()
 @on_free_cores()
-def sampling_bounds(
-    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
-) -> SamplingBounds:
+def sampling_bounds(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> SamplingBounds:
     """Lowest and highest sampling rate of each Gaussian over the cameras that see it (highest: Mip-Splatting, eq. 7).
 
-    Memory beyond the result and one float64 copy of the means is bounded by `chunk_pairs`.
+    Memory beyond the result and one float64 copy of the means is bounded by `CHUNK_PAIRS`.
     """
     highest, lowest, nearest = (means.new_zeros(len(means)) for _ in range(3))
     focals = means.new_tensor([camera.focal for camera in cameras])
     views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
-    for part, rates in rates_in_chunks(means, cameras, chunk_pairs):
+    for part, rates in rates_in_chunks(means, cameras):
         visible = rates > 0
         views[part] = visible.sum(dim=1, dtype=torch.int32)
         highest[part] = rates.amax(dim=1)
@@ -99,12 +97,10 @@ def sampling_bounds(
 
 
 @on_free_cores()
-def median_rates(
-    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
-) -> Float[Tensor, " n"]:
+def median_rates(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 if none does."""
     median = means.new_zeros(len(means))
-    for part, rates in rates_in_chunks(means, cameras, chunk_pairs):
+    for part, rates in rates_in_chunks(means, cameras):
         median[part] = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values.nan_to_num(0.0)
     return median
 
@@ -140,7 +136,7 @@ def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_shar
 
 
 def rates_in_chunks(
-    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera]
 ) -> Iterator[tuple[slice, Float[Tensor, "c v"]]]:
     """Yield (chunk of the Gaussians, its rate in every camera); a rate of 0 means "not seen".
 
@@ -152,7 +148,7 @@ def rates_in_chunks(
     rotation, offset = poses[:, :3, :3].to(means), offset.to(means)
     intrinsics = [[c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.focal] for c in cameras]
     fx, fy, cx, cy, width, height, focal = means.new_tensor(intrinsics).T
-    step = max(1, chunk_pairs // len(cameras))
+    step = max(1, CHUNK_PAIRS // len(cameras))
     for start in range(0, len(means), step):
         part = slice(start, min(start + step, len(means)))
         local = (means[part].double() - origin).to(means)

@@ -6,7 +6,6 @@ Keys at the top hold for every scene; a [[scene]] table names one scene and may 
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,10 @@ SCENES_KEY = "scene"
 PATH_KEYS = ("scene", "model_path", "cameras", "output", "lpips")
 
 
-@dataclass(frozen=True)
-class BatchFile:
-    """The settings of all scenes, and each scene's own by its name; keys have underscores."""
+def read_batch(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The settings of all scenes, and each scene's own by its name, or else that of its file or folder.
 
-    shared: Mapping[str, Any]
-    scenes: Mapping[str, Mapping[str, Any]]
-
-
-def read_batch(path: str | PathLike[str]) -> BatchFile:
-    """Read a batch file.  A scene without a name gets that of its file or folder.
+    Keys have underscores.
 
     Raises FormatError if it is not TOML, names no scene, or names two scenes alike.
     """
@@ -40,7 +33,7 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
     tables = document.pop(SCENES_KEY, None)
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise FormatError(path, "names no scene; it needs a [[scene]] table for each")
-    scenes: dict[str, Mapping[str, Any]] = {}
+    scenes: dict[str, dict[str, Any]] = {}
     for number, table in enumerate(tables, start=1):
         settings = _settings(table, path.parent)
         file = settings.get("scene") or settings.get("model_path")
@@ -51,7 +44,7 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
         if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
             raise FormatError(path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ...")
         scenes[name] = settings
-    return BatchFile(_settings(document, path.parent), scenes)
+    return _settings(document, path.parent), scenes
 
 
 def _settings(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -52,16 +52,9 @@ STDERR = 2  # file descriptor, which the codecs write to directly
 log = logging.getLogger("aaplug")
 
 
-class _Header(NamedTuple):
-    """Width and height in px, and transparency, as a file declares them before its pixels."""
-
-    size: tuple[int, int]
-    transparent: bool
-
-
 def image_size(path: str | PathLike[str]) -> tuple[int, int]:
     """Width and height in px as stored, from the header alone."""
-    return _look(Path(path)).size
+    return _look(Path(path))[0]
 
 
 @contract
@@ -107,25 +100,6 @@ def write_png(
         stream.write(png)
 
 
-def encode_webp(rgb: Float[Tensor, "h w c"], quality: int | None) -> bytes:
-    """A WebP file of colours, and straight alpha if there is, clamped to [0, 1], in 8 bits.
-
-    quality: 1 to 100; None is lossless.
-    """
-    return encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, LOSSLESS_WEBP if quality is None else quality)
-
-
-def encode_jpeg(rgb: Float[Tensor, "h w 3"], quality: int) -> bytes:
-    """A JPEG file of colours clamped to [0, 1], with colour at full resolution.  quality: 1 to 100."""
-    settings = cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
-    return encoded(".jpg", rgb, *settings)
-
-
-def encode_png(rgb: Float[Tensor, "h w c"]) -> bytes:
-    """A PNG file of 8 bits, of colours or of one channel, clamped to [0, 1]; quick rather than small."""
-    return encoded(".png", rgb, cv2.IMWRITE_PNG_COMPRESSION, 1)
-
-
 def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "h w c"]:
     """An image that can be stored, without gradients; raises UsageError for anything but finite floats [h, w, c]."""
     got = f"{image.dtype} {list(image.shape)}" if isinstance(image, Tensor) else type(image).__name__
@@ -138,10 +112,13 @@ def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "
 
 
 @torch_threads(1)
-def encoded(suffix: str, image: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
+def encoded(suffix: str, image: Float[Tensor, "h w c"], quality: int | None = None, bit_depth: int = 8) -> bytes:
     """The file of an image with 1, 3 or 4 channels, of which the fourth is straight alpha, clamped to [0, 1].
 
     Bands of rows are converted to OpenCV's BGR order one by one, which keeps the float copies small.
+
+    quality: of a .jpg, whose colour has full resolution, or a .webp, 1 to 100; None is 95, or lossless.  A .png is
+        made quickly rather than small if it is 1.
     """
     if bit_depth not in SAMPLE_TYPES:
         raise UsageError("bit_depth", not_one_of(bit_depth, map(str, SAMPLE_TYPES)))
@@ -149,13 +126,19 @@ def encoded(suffix: str, image: Float[Tensor, "h w c"], *settings: int, bit_dept
     order = [2, 1, 0, 3][: image.shape[2]] if image.shape[2] > 1 else [0]
     bands = (levels(rows, bit_depth)[..., order].cpu().numpy() for rows in image.split(ROWS_PER_BAND))
     samples = np.concatenate([band.astype(SAMPLE_TYPES[bit_depth]) for band in bands])
-    success, file = cv2.imencode(suffix, samples, settings)
+    full = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    settings = {
+        ".jpg": (cv2.IMWRITE_JPEG_QUALITY, 95 if quality is None else quality, *full),
+        ".webp": (cv2.IMWRITE_WEBP_QUALITY, LOSSLESS_WEBP if quality is None else quality),
+        ".png": () if quality is None else (cv2.IMWRITE_PNG_COMPRESSION, quality),
+    }
+    success, file = cv2.imencode(suffix, samples, settings[suffix])
     assert success
     return file.tobytes()
 
 
-def _look(path: Path) -> _Header:
-    """The header, within the limits."""
+def _look(path: Path) -> tuple[tuple[int, int], bool]:
+    """Width and height in px, and whether it is transparent, as a file within the limits declares before its pixels."""
     pillow_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it is lower than ours and only warns
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
@@ -172,13 +155,13 @@ def _look(path: Path) -> _Header:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
     if stored > MAX_PIXEL_SIZE * pixels + whole_limit("IMAGE_EXTRA"):
         raise FormatError(path, f"has {stored:,} bytes, which {size[0]}x{size[1]} px do not need")
-    return _Header(size, transparent)
+    return size, transparent
 
 
 @torch_threads(1)
 def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
     """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
-    header = _look(path)
+    size, transparent = _look(path)
     try:
         data = _still(path, path.read_bytes())
         with captured_stderr() as words:
@@ -193,11 +176,11 @@ def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Fl
     if damage := next((line for line in lines if line.startswith(DAMAGE_MESSAGE)), ""):
         log.warning("%s: is damaged (%s)", path, damage)
     height, width, *stored = samples.shape
-    if (width, height) != header.size:
-        raise FormatError(path, f"has {width}x{height} px where its header says {header.size[0]}x{header.size[1]}")
+    if (width, height) != size:
+        raise FormatError(path, f"has {width}x{height} px where its header says {size[0]}x{size[1]}")
     if samples.dtype not in SAMPLE_TYPES.values():
         raise FormatError(path, f"holds {samples.dtype} samples; save it with 8 or 16 bits")
-    if header.transparent != (stored == [ALPHA_CHANNELS]):
+    if transparent != (stored == [ALPHA_CHANNELS]):
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
     samples = samples.reshape(height, width, -1)
     order = [0, 0, 0] if samples.shape[2] == 1 else [2, 1, 0, 3][: samples.shape[2]]  # from BGR(A) or gray

@@ -19,10 +19,9 @@ from aaplug.core.imaging import linear, straight
 from aaplug.core.passes import PASSES
 from aaplug.io.atomic import replacing, replacing_file
 from aaplug.io.image_formats import COLOURS, Storage
-from aaplug.io.images import encode_jpeg, encode_webp, encoded
+from aaplug.io.images import encoded
 from aaplug.system.contracts import contract
 
-JPEG_QUALITY = 95  # of 100
 INTEROP_IDS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_scene"}  # of the Color Interop Forum
 MAX_HALF = 65504.0  # the largest finite half
 
@@ -64,9 +63,7 @@ def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -
         matte = alpha[..., None]
         image = matte if image is None else torch.cat([straight(image, alpha), matte], dim=2)
     assert image is not None
-    if storage.format.name == "png":
-        return encoded(".png", image, bit_depth=storage.bit_depth)
-    return encode_webp(image, None) if storage.format.name == "webp" else encode_jpeg(image, JPEG_QUALITY)
+    return encoded(f".{storage.format.name}", image, bit_depth=storage.bit_depth)
 
 
 def _write_exr(

@@ -11,7 +11,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.convolution import face_log_factor, smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import rotation_matrices
-from aaplug.core.sampling import CHUNK_PAIRS, mean_position, rates_in_chunks
+from aaplug.core.sampling import mean_position, rates_in_chunks
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 
@@ -68,9 +68,7 @@ class FlatSmoothing:
         )
 
 
-def view_information(
-    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
-) -> Float[Tensor, "n 3 3"]:
+def view_information(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, "n 3 3"]:
     """Directional sampling density of each Gaussian: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per unit².
 
     Along u, uᵀ M u is the summed squared rate; a camera adds nothing along its own ray d.  0 if no camera sees it.
@@ -78,7 +76,7 @@ def view_information(
     origin = mean_position(cameras)
     eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
     information = means.new_zeros(len(means), 3, 3)
-    for part, rates in rates_in_chunks(means, cameras, chunk_pairs):
+    for part, rates in rates_in_chunks(means, cameras):
         local = (means[part].double() - origin).to(means)
         rays = torch.nn.functional.normalize(local[:, None] - eyes, dim=2) * rates[:, :, None]
         total = rates.square().sum(dim=1)[:, None, None] * torch.eye(3).to(means)

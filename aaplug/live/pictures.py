@@ -22,7 +22,7 @@ from aaplug.core.colours import Colour
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras.camera_path import EXACT
-from aaplug.io.images import encode_jpeg, encode_png, image_size
+from aaplug.io.images import encoded, image_size
 from aaplug.io.photographs import photo_at
 from aaplug.live.messages import Order, PickRequest, PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS, depth_map
@@ -90,7 +90,7 @@ class Pictures:
         if request.overlay is not None:
             yield None
             levels, legend = OVERLAYS[request.overlay](self._subject.renderer(request.sides[1]), camera, counts[1])
-            parts.append(Part("paint", (0, camera.width), encode_png(levels[..., None])))
+            parts.append(Part("paint", (0, camera.width), encoded(".png", levels[..., None], 1)))
             facts |= {"legend": legend}
         yield _picture(request, parts, started, stage="done", samples=counts, **facts)
 
@@ -108,7 +108,7 @@ class Pictures:
         renderer = self._subject.renderer(request.sides[order.side], request.background)
         render = yield from strips(renderer, camera, _bounded_samples(renderer, camera))
         name = f"{request.sides[order.side].recipe}-{order.width}x{order.height}.png"
-        yield message({"still": name}, [encode_png(render.rgb)])
+        yield message({"still": name}, [encoded(".png", render.rgb, 1)])
 
     def _preview(self, request: PictureRequest, camera: Camera) -> bytes:
         """Both visible parts, in the time of a frame: coarser, with fewer Gaussians, or as they are if they fit."""
@@ -129,7 +129,7 @@ class Pictures:
             view = replace(camera, width=right - left, cx=camera.cx - left)
             view = view.resized(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
             rgb = replace(renderer, recipe=recipe)(view).rgb
-            parts.append(Part(str(i), (left, right), encode_jpeg(rgb, PREVIEW_QUALITY)))
+            parts.append(Part(str(i), (left, right), encoded(".jpg", rgb, PREVIEW_QUALITY)))
             gaussians = max(gaussians, len(renderer.scene))
         is_limited = too_many or max_gaussians < len(self._subject.look.scene)
         self._effort = _adapted(self._effort, time.perf_counter() - started, is_limited)
@@ -204,7 +204,7 @@ def _picture(request: PictureRequest, parts: list[Part], started: float, **facts
 
 def _part_at_rest(of: str, span: Span, rgb: Float[Tensor, "h w 3"]) -> Part:
     lossless = rgb.shape[0] * rgb.shape[1] <= MAX_LOSSLESS_PIXELS
-    return Part(of, span, encode_png(rgb) if lossless else encode_jpeg(rgb, RESTING_QUALITY))
+    return Part(of, span, encoded(".png", rgb, 1) if lossless else encoded(".jpg", rgb, RESTING_QUALITY))
 
 
 def _spans(request: PictureRequest) -> tuple[Span, Span]:

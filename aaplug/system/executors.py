@@ -37,7 +37,6 @@ ITEMS_PER_WORKER = 2  # waiting or at work, so that no worker is idle
 
 T = TypeVar("T")
 R = TypeVar("R")
-Result = TypeVar("Result", covariant=True)
 Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]  # like `map`, and each executor's
 
 
@@ -47,14 +46,6 @@ class Executor(Protocol):
 
     def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield `work(item)` of every item."""
-        ...
-
-
-class Pending(Protocol[Result]):
-    """A result to come."""
-
-    def result(self) -> Result:
-        """Wait for it."""
         ...
 
 
@@ -178,9 +169,9 @@ def torch_threads(count: int, given: int | None = None) -> Iterator[None]:
 
 
 def results(
-    submit: Callable[[T], Pending[R]], items: Iterable[T], most: Callable[[], int], ordered: bool = True
-) -> Iterator[R]:
-    """Yield the results, with at most `most()` items submitted and not yet yielded."""
+    submit: Callable[[T], Any], items: Iterable[T], most: Callable[[], int], ordered: bool = True
+) -> Iterator[Any]:
+    """Yield the results, with at most `most()` items submitted, each to a future, and not yet yielded."""
     waiting: deque[Any] = deque()
     for item in items:
         waiting.append(submit(item))

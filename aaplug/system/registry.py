@@ -11,7 +11,7 @@ first used, so that names can be listed without importing anything.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -84,7 +84,7 @@ class Registry(Mapping[str, T]):
                 value: Any = self._built_in[name]
                 self._add(name, _at(value) if isinstance(value, str) else value, f"{self.kind} {name}")
         if name not in self._entries:
-            raise NoEntryError(self.kind, unknown(str(name), list(self)))
+            raise NoEntryError(self.kind, not_one_of(name, self, "; if a package adds it, is that installed?"))
         return self._entries[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -105,9 +105,10 @@ class Registry(Mapping[str, T]):
         Raises:
             UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
         """
-        if name not in self._built_in and name not in list(self):
-            raise UsageError(parameter or self.kind, unknown(name, list(self)))
-        return self[name]
+        try:
+            return self[name]
+        except NoEntryError as error:
+            raise UsageError(parameter or self.kind, error.problem) from None
 
     @contract
     def register(self, name: str, value: T) -> None:
@@ -174,11 +175,6 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
         return names
     ours = {p.name for p in _points().select(group=group_of(kind)) if p.module.startswith("aaplug.")}
     return [name for name in names if name not in ours]
-
-
-def unknown(name: str, names: Collection[str]) -> str:
-    """Message for a name that is in no registry: the closest one, or the question for the package that adds it."""
-    return not_one_of(name, names, "; if a package adds it, is that installed?")
 
 
 def registry_of(kind: str) -> Any:  # a run-time check of a registry would load its entries

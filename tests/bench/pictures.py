@@ -20,7 +20,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.plots import COLOURS, MARKERS, Plot
 from aaplug.evaluation.results import CEILING, scale_name
 from aaplug.io.cameras import read_cameras
-from aaplug.io.images import encode_webp, read_image
+from aaplug.io.images import encoded, read_image
 from aaplug.io.scenes import read_scene
 from aaplug.rendering.renderer import Renderer
 from tests.bench.concepts import concepts
@@ -57,7 +57,7 @@ def main() -> None:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         pictures = {f"{plot.name}.svg": plot.svg().encode() for plot in (*concepts(scene, cameras), scales(), laws())}
         pictures |= gallery(scene, cameras)
-        pictures["lenses.webp"] = encode_webp(lenses(scene), ENLARGED_QUALITY)
+        pictures["lenses.webp"] = encoded(".webp", lenses(scene), ENLARGED_QUALITY)
         pictures |= {f"panorama-{recipe}.webp": around(scene, recipe) for recipe in ("classic", "auto")}
     for name, content in pictures.items():
         (FOLDER / name).write_bytes(content)
@@ -87,7 +87,7 @@ def around(chair: Gaussians, recipe: str) -> bytes:
     """A panorama of the furnished room at 1/4 of the rate that its cameras trained at."""
     eye, ahead, up = torch.tensor([0.6, -2.3, -1.3]), torch.tensor([0.0, 0.0, -1.3]), torch.tensor([0.0, 0.0, 1.0])
     renderer = Renderer.of(furnished(chair), inside(), recipe, min_seen=0)
-    return encode_webp(renderer(panorama(look_at(eye, ahead, up), PANORAMA)).rgb.clamp(0, 1), ENLARGED_QUALITY)
+    return encoded(".webp", renderer(panorama(look_at(eye, ahead, up), PANORAMA)).rgb.clamp(0, 1), ENLARGED_QUALITY)
 
 
 def scales() -> Plot:
@@ -132,7 +132,7 @@ def gallery(scene: Gaussians, cameras: CameraSet) -> dict[str, bytes]:
         y, x = _detail(camera) if scale > 1 else _opaque(drawn["auto"])
         quality = ENLARGED_QUALITY if scale > 1 else None
         for recipe, image in drawn.items():
-            images[f"chair-{name}-{camera.width}-{recipe}.webp"] = encode_webp(image[y, x], quality)
+            images[f"chair-{name}-{camera.width}-{recipe}.webp"] = encoded(".webp", image[y, x], quality)
     return images
 
 

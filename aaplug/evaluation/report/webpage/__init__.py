@@ -19,7 +19,7 @@ from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.report.pages import assembled
 from aaplug.evaluation.report.plots import BOUNDS, Plot
 from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, cost_cells, mean, metric_cells, scale_name
-from aaplug.io.images import encode_webp, image_size, read_image
+from aaplug.io.images import encoded, image_size, read_image
 
 COSTS = (  # the meaning of the tables of `cost_cells`
     "rendering alone, on the machine that the protocol names; below, the quartiles over the views",
@@ -107,10 +107,10 @@ def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
         if truth.is_file():
             files[view, scale][TRUTH] = truth
     paths, shots = [path for roles in files.values() for path in roles.values()], []
-    encoded = {path: encode_webp(read_image(path, None), None) for path in paths}
-    if sum(map(len, encoded.values())) > LOSSLESS_BYTES:
-        encoded = {path: encode_webp(read_image(path, None), LOSSY_QUALITY) for path in paths}
-    uris = {path: "data:image/webp;base64," + base64.b64encode(webp).decode() for path, webp in encoded.items()}
+    webps = {path: encoded(".webp", read_image(path, None)) for path in paths}
+    if sum(map(len, webps.values())) > LOSSLESS_BYTES:
+        webps = {path: encoded(".webp", read_image(path, None), LOSSY_QUALITY) for path in paths}
+    uris = {path: "data:image/webp;base64," + base64.b64encode(webp).decode() for path, webp in webps.items()}
     scores = {  # of the report's first metric against the truth
         (m.view, m.scale, m.recipe): _with_unit(metric, value)
         for metric in report.compared[:1]
