@@ -7,7 +7,7 @@ import torch
 
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
-from aaplug.core.culling import cull
+from aaplug.core.ellipses import cull
 from aaplug.core.projection import project
 from aaplug.core.shading import shade
 from aaplug.evaluation.engine import Task, candidates_of, evaluate

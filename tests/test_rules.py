@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.culling import cull
+from aaplug.core.ellipses import cull
 from aaplug.core.interfaces import PixelKernel
 from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from aaplug.core.convolution import smoothed_by, volume_log_factor
-from aaplug.core.culling import cull
-from aaplug.core.ellipses import squared_cutoff, whitening
+from aaplug.core.ellipses import cull, squared_cutoff, whitening
 from aaplug.core.gaussians import MIN_OPACITY, scale_opacities
 from aaplug.core.splats import Splats2D
 from tests.conftest import make_scene, make_splats

@@ -89,7 +89,9 @@ def frame_of(scene: Gaussians, up: Sequence[float] | None = None) -> Frame:
     return Frame(centre, radius, axis, _front(axis, side, shape), outside)
 
 
-def orbit(frame: Frame, count: int, size: tuple[int, int], elevation: float, fov: float) -> tuple[Camera, ...]:
+def orbit(
+    frame: Frame, count: int, size: tuple[int, int], elevation: float, fov: float, name: str = "orbit"
+) -> tuple[Camera, ...]:
     """Free cameras on a circle around the frame, evenly spaced, named by their number.
 
     size: width and height in px.  elevation: above the horizon, fov: along the image's shorter side; in radians.
@@ -102,7 +104,7 @@ def orbit(frame: Frame, count: int, size: tuple[int, int], elevation: float, fov
         level = math.cos(turn) * frame.front + math.sin(turn) * side
         eye = frame.centre + distance * (math.cos(elevation) * level + math.sin(elevation) * frame.up)
         pose = look_at(eye, frame.centre, frame.up)
-        views.append(centred(f"orbit_{index:0{len(str(count - 1))}}", size, focal, pose))
+        views.append(centred(f"{name}_{index:0{len(str(count - 1))}}", size, focal, pose))
     return tuple(views)
 
 

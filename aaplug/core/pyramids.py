@@ -103,11 +103,6 @@ class Pyramid:
         return self.scene[self.places[number]]
 
     @property
-    def coarsest_rate(self) -> float:
-        """The lowest sampling rate that there is a level for, relative to training's."""
-        return 0.5 ** (len(self) - 1)
-
-    @property
     def places(self) -> list[slice]:
         """The slice of each level's Gaussians."""
         return [slice(*ends) for ends in itertools.pairwise([0, *itertools.accumulate(self.sizes)])]

@@ -1,10 +1,13 @@
 """2D Gaussians of one view: discs, as planes through which rays pass (2DGS, Huang et al. 2024, arXiv 2403.17888).
 
-n: Gaussians; m: discs that the image shows; h, w: px.  A disc's point u, v, in standard deviations along its two
-tangents, is seen at pixel x, y and depth z by M (u, v, 1)ᵀ = (x z, y z, z).  M is its ray transform (2DGS, eqs. 7, 9).
+n: Gaussians; m: discs that the image shows; t: tiles; P: pixels per tile; p: pixels; h, w: px.  A disc's point u, v, in
+standard deviations along its two tangents, is seen at pixel x, y and depth z by M (u, v, 1)ᵀ = (x z, y z, z).  M is its
+ray transform (2DGS, eqs. 7, 9).
+
+w_i = alpha_i T_i: weight of the i-th disc of a pixel, in front of which the transmittance is T_i.  m_i: its depth.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -12,13 +15,20 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.cameras import Camera
+from aaplug.core.colours import BLACK
+from aaplug.core.interfaces import Limits, Pixels, Rasterizer
 from aaplug.core.projection import rotation_matrices
+from aaplug.core.rules import RULES_GSPLAT, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.gsplat.arguments import Options, View
+from aaplug.methods.order import Order
+from aaplug.methods.pixel_kernels.surfel import SURFEL, Surfel
+from aaplug.rendering.passes import MAX_NUMBER
 
 REACH = 3.33  # standard deviations: gsplat's radius of a disc
 MIN_REACH = 0.01  # px: gsplat's least standard deviation of a disc's box
 MIN_FACING = 1e-4  # of its squared size in px: a disc nearer to edge-on is drawn as a line this thin
+BELOW_1 = 1 - 2.0**-24  # the float32 below it
 MIN_SIZE = 1e-8  # px: smaller discs are drawn by their low-pass filter alone, at any size
 
 
@@ -116,3 +126,49 @@ def normals_of_depth(depth: Float[Tensor, "h w 1"], camera: Camera) -> Float[Ten
     right = points[1:-1, 2:] - points[1:-1, :-2]
     normals = functional.normalize(torch.linalg.cross(down, right), dim=2)
     return functional.pad(normals, (0, 0, 1, 1, 1, 1))
+
+
+def distortion(splats: Splats2D, options: Options, rasterizer: Rasterizer) -> Float[Tensor, "h w 1"]:
+    """Σ_i Σ_(j<i) 2 w_i w_j (m_i - m_j): 2DGS, eq. 13, with the depth of centres, as gsplat has it.
+
+    With T the transmittance behind everything, D = Σ w_i m_i, and w_i (T_i + T_(i+1)) = T_i² - T_(i+1)², the sum is
+    2 (D (1 + T) - Σ (T_i² - T_(i+1)²) m_i).  The last sum is the depth of discs that are all drawn twice, one copy
+    behind the other.  The difference is small, so both are drawn in float64.
+    """
+    exact = splats.to(torch.float64)
+    exact = replace(exact, rgb=exact.depths[:, None].expand(-1, 3))
+    rules = options.convention.rules
+    once = rasterizer(exact, options.hw, BLACK, SURFEL, None, rules)
+    squared = replace(rules, max_alpha=BELOW_1, min_transmittance=rules.min_transmittance**2)
+    twice = rasterizer(exact, options.hw, BLACK, Twice(once=rules), None, squared)
+    return (2 * (once.rgb[..., :1] * (2 - once.alpha[..., None]) - twice.rgb[..., :1])).to(splats.means)
+
+
+@dataclass(frozen=True)
+class Twice(Surfel):
+    """Two discs of the same place, one behind the other, by the rules `once` of each."""
+
+    name: str = "surfel-twice"
+    once: Rules = RULES_GSPLAT
+
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
+        """1 - (1 - alpha)² = alpha (2 - alpha)."""
+        alpha = super().alpha(rows, pixels, Limits.by(self.once)).clamp(max=self.once.max_alpha)
+        return alpha * (2 - alpha)
+
+    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
+        """The same, over the opacity."""
+        alpha = (splats.opacities * super().exact(splats, offsets)).clamp(max=self.once.max_alpha)
+        alpha = torch.where(alpha >= self.once.min_alpha, alpha, 0.0)
+        return alpha * (2 - alpha) / splats.opacities.clamp(min=self.once.min_alpha)
+
+
+def median_depth(splats: Splats2D, options: Options, rasterizer: Rasterizer) -> Float[Tensor, "h w 1"]:
+    """Depth of the last disc in front of which the transmittance is above a half; 0 where there is none."""
+    with torch.no_grad():
+        numbered = splats if len(splats) <= MAX_NUMBER else splats.to(torch.float64)
+        numbers = torch.arange(len(splats), device=splats.means.device).to(numbered.depths)
+        numbered = replace(numbered, rgb=torch.stack([numbered.depths, numbers, 0 * numbers], dim=1))
+        last = Order(SURFEL, ("last", "last", "last", "last"))
+        found = rasterizer(numbered, options.hw, BLACK, SURFEL, last, options.convention.rules).rgb[..., :1]
+    return torch.cat([splats.depths, splats.depths.new_zeros(1)])[found.long()]  # -1, the last: no disc

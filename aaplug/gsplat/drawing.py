@@ -4,7 +4,7 @@ m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -42,46 +42,38 @@ Image = tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]
 AddGradient = Callable[[Float[Tensor, "m 2"]], object]
 
 
-@dataclass(frozen=True, eq=False)
-class ViewSplats:
-    """The splats of one image without colour.  radii: half the sides of their bounding boxes along x and y, in px."""
+def splats_of(view: View, options: Options, kernels: Kernels) -> tuple[Splats2D, Int[Tensor, "m 2"]]:
+    """The splats that gsplat keeps, after the screen filter of `rasterize_mode`, and half the sides of their boxes.
 
-    splats: Splats2D
-    radii: Int[Tensor, "m 2"]
-
-    @classmethod
-    def of(cls, view: View, options: Options, kernels: Kernels) -> "ViewSplats":
-        """The splats that gsplat keeps, after the screen filter of `rasterize_mode`.
-
-        It drops what lies beyond a plane, has an opacity below 1/255, a radius of at most `radius_clip` along both
-        axes, or a box outside of the image.
-        """
-        rules, camera = options.convention.rules, view.camera
-        if view.covars is None and camera.lens == PINHOLE:
-            splats = project(view.scene, camera, kernels, rules)
-            splats = replace(splats, opacities=view.opacities.index_select(0, splats.sources))
-        else:
-            sigma = view.covars
-            if sigma is None:
-                factor = rotation_matrices(view.scene.unit_quats.double()) * view.scene.scales.double()[:, None]
-                sigma = factor @ factor.mT
-            splats = project_covariances(view.scene.means, sigma, view.opacities, camera, rules)
-        if options.rasterize_mode == "matched":
-            splats = Matched("global")(splats, camera, TrainingViews(options.convention, [camera], NO_BOUNDS))
-        else:
-            splats = splats.blurred(options.eps2d, options.convention.compensated, MIN_COMPENSATION)
-        with torch.no_grad():
-            reach = squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=0.0).sqrt()
-            radii = (reach[:, None] * splats.covs[:, ::2].sqrt()).ceil().clamp(max=MAX_RADIUS)
-        low, high = splats.means - radii, splats.means + radii
-        keep = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
-        keep = keep & (radii > options.radius_clip).any(dim=1)
-        keep = keep & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
-        splats = splats[keep]
-        if not options.global_z_order:
-            offsets = view.scene.means.index_select(0, splats.sources).double() - camera.centre
-            splats = replace(splats, depths=torch.linalg.vector_norm(offsets, dim=1).to(splats.depths))
-        return cls(splats, radii[keep].int())
+    It drops what lies beyond a plane, has an opacity below 1/255, a radius of at most `radius_clip` along both
+    axes, or a box outside of the image.  Sides are along x and y, in px.
+    """
+    rules, camera = options.convention.rules, view.camera
+    if view.covars is None and camera.lens == PINHOLE:
+        splats = project(view.scene, camera, kernels, rules)
+        splats = replace(splats, opacities=view.opacities.index_select(0, splats.sources))
+    else:
+        sigma = view.covars
+        if sigma is None:
+            factor = rotation_matrices(view.scene.unit_quats.double()) * view.scene.scales.double()[:, None]
+            sigma = factor @ factor.mT
+        splats = project_covariances(view.scene.means, sigma, view.opacities, camera, rules)
+    if options.rasterize_mode == "matched":
+        splats = Matched("global")(splats, camera, TrainingViews(options.convention, [camera], NO_BOUNDS))
+    else:
+        splats = splats.blurred(options.eps2d, options.convention.compensated, MIN_COMPENSATION)
+    with torch.no_grad():
+        reach = squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=0.0).sqrt()
+        radii = (reach[:, None] * splats.covs[:, ::2].sqrt()).ceil().clamp(max=MAX_RADIUS)
+    low, high = splats.means - radii, splats.means + radii
+    keep = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
+    keep = keep & (radii > options.radius_clip).any(dim=1)
+    keep = keep & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
+    splats = splats[keep]
+    if not options.global_z_order:
+        offsets = view.scene.means.index_select(0, splats.sources).double() - camera.centre
+        splats = replace(splats, depths=torch.linalg.vector_norm(offsets, dim=1).to(splats.depths))
+    return splats, radii[keep].int()
 
 
 @on_free_cores()

@@ -1,5 +1,6 @@
 """The function itself; see the package's docstring."""
 
+from dataclasses import replace
 from typing import Annotated, Any
 
 import torch
@@ -13,8 +14,8 @@ from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.drawing import ViewSplats, draw
-from aaplug.gsplat.table import Layout, table_of
+from aaplug.gsplat.drawing import draw, splats_of
+from aaplug.gsplat.table import Layout, conics
 from aaplug.rasterizers.choice import kernels_of
 from aaplug.system.contracts import Range, contract
 
@@ -129,10 +130,18 @@ def rasterization(
     views = views_of(*tensors, relative_rate, options, (radial_coeffs, tangential_coeffs, thin_prism_coeffs))
     painter = rasterizer_of(rasterizer) if isinstance(rasterizer, str) else rasterizer
     kernels = kernels_of(painter)
-    parts = [ViewSplats.of(view, options, kernels) for view in views]
-    sources = [part.splats.sources for part in parts]
-    layout = Layout.of(sources, viewmats.shape[:-2], means.shape[-2], packed)
-    meta, splats = table_of(parts, layout, options)
+    splats, radii = zip(*(splats_of(view, options, kernels) for view in views), strict=True)
+    layout = Layout.of([part.sources for part in splats], viewmats.shape[:-2], means.shape[-2], packed)
+    meta = layout.facts(options) | {
+        "radii": layout.column(radii),
+        "means2d": layout.column([part.means for part in splats]),
+        "depths": layout.column([part.depths for part in splats]),
+        "conics": layout.column([conics(part) for part in splats]),
+        "opacities": layout.column([part.opacities for part in splats]),
+    }
+    # read from the table, so that gradients of images pass through it
+    columns = zip(splats, *(layout.split(meta[name]) for name in ("means2d", "depths", "opacities")), strict=True)
+    splats = [replace(part, means=means, depths=z, opacities=opacity) for part, means, z, opacity in columns]
     adders = layout.gradient_adders(meta["means2d"]) if absgrad else len(views) * [None]
     images = [
         draw(part, view, options, painter, kernels, add) for part, view, add in zip(splats, views, adders, strict=True)

@@ -15,8 +15,7 @@ from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.disc_depths import distortion, median_depth
-from aaplug.gsplat.discs import Discs, normals_of_depth, splats_of
+from aaplug.gsplat.discs import Discs, distortion, median_depth, normals_of_depth, splats_of
 from aaplug.gsplat.drawing import composited, features_of, finished
 from aaplug.gsplat.drop_in import Above0, From0, Kernel, MaxAlpha
 from aaplug.gsplat.table import Layout

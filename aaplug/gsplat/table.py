@@ -6,7 +6,7 @@ turn.  Packed, the table has a row for each splat, [s, ...]; else it has one for
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from aaplug.core.splats import Splats2D
 from aaplug.gsplat.arguments import Options
-from aaplug.gsplat.drawing import ViewSplats
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,28 +77,10 @@ class Layout:
         """Functions that add each image's absolute gradients to `means2d.absgrad`, which gsplat's users read."""
         total = torch.zeros_like(means2d)
         means2d.absgrad = total  # pyright: ignore[reportAttributeAccessIssue]
-        adders: list[Callable[[Tensor], object]] = [
-            partial(total.view(-1, 2).index_add_, 0, rows) for rows in self.rows.split(self.counts)
-        ]
-        return adders
+        return [partial(total.view(-1, 2).index_add_, 0, rows) for rows in self.rows.split(self.counts)]
 
 
-def table_of(parts: Sequence[ViewSplats], layout: Layout, options: Options) -> tuple[dict[str, Any], list[Splats2D]]:
-    """The table, and the splats of each image read from it, so that gradients of images pass through it."""
-    splats = [part.splats for part in parts]
-    columns = {
-        "radii": [part.radii for part in parts],
-        "means2d": [part.means for part in splats],
-        "depths": [part.depths for part in splats],
-        "conics": [_conics(part) for part in splats],
-        "opacities": [part.opacities for part in splats],
-    }
-    meta = layout.facts(options) | {name: layout.column(values) for name, values in columns.items()}
-    rows = zip(splats, *(layout.split(meta[name]) for name in ("means2d", "depths", "opacities")), strict=True)
-    return meta, [replace(part, means=means, depths=z, opacities=opacities) for part, means, z, opacities in rows]
-
-
-def _conics(splats: Splats2D) -> Float[Tensor, "m 3"]:
+def conics(splats: Splats2D) -> Float[Tensor, "m 3"]:
     """Inverses of the covariances: xx, xy, yy in 1/px²."""
     xx, xy, yy = splats.covs.unbind(dim=1)
     return torch.stack([yy, -xy, xx], dim=1) / splats.dets[:, None]

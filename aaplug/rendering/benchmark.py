@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from aaplug.core.cameras import Camera, centred, look_at
-from aaplug.core.culling import cull
+from aaplug.core.ellipses import cull
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project

@@ -21,7 +21,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet, Factor
 from aaplug.core.colours import BLACK, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
-from aaplug.core.culling import cull
+from aaplug.core.ellipses import cull
 from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
@@ -351,7 +351,7 @@ class Renderer:
         if samples is None:
             samples = recipe.samples_at(rate) if recipe.target_rate else recipe.grid
             if recipe.target_rate and self.cutter is not None and recipe.levels is not None:
-                for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
+                for_coarsest = math.ceil(0.5 ** (len(self.cutter.pyramid) - 1) / rate - RATE_TOLERANCE)
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
         sampled_rate = max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
         return samples, recipe.neighbours_at(sampled_rate) if weighs else 0.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.culling import cull
+from aaplug.core.ellipses import cull
 from aaplug.core.imaging import average_samples
 from aaplug.core.splats import Render
 from aaplug.rendering.renderer import Renderer

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, Lens, opencv_lens
+from aaplug.core.lenses import EQUIRECT, Lens, opencv_lens
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
@@ -27,17 +27,11 @@ from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
 MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
+FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 LENSES: dict[str, Callable[..., Lens]] = {  # by the model's distortion parameters, in COLMAP's order
-    "SIMPLE_RADIAL": lambda k1: opencv_lens((k1,)),
-    "RADIAL": lambda k1, k2: opencv_lens((k1, k2)),
-    "OPENCV": lambda *k: opencv_lens(k),
-    "FULL_OPENCV": lambda *k: opencv_lens(k),
+    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"), lambda *k: opencv_lens(k)),
+    **dict.fromkeys(FISHEYES, lambda *k: opencv_lens(k, fisheye=True)),
     PANORAMA: lambda: EQUIRECT,
-    "SIMPLE_FISHEYE": lambda: EQUIDISTANT,
-    "FISHEYE": lambda: EQUIDISTANT,
-    "SIMPLE_RADIAL_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
-    "RADIAL_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
-    "OPENCV_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
     "THIN_PRISM_FISHEYE": lambda k1, k2, p1, p2, k3, k4, sx1, sy1: Lens(
         "equidistant", (k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0)
     ),

@@ -94,12 +94,12 @@ def _load(read: Read, read_harmonics: Read, ends: Sequence[Float[Tensor, "2 3"]]
     words = rows["quats"][:, None] >> np.arange(4, dtype=np.uint32) * QUATERNION_BITS
     rest = (floats(words[:, :3] & MOST_QUATERNION) / MOST_QUATERNION - 0.5) * 2**0.5
     quats = largest_last(rest, torch.from_numpy(words[:, 3].astype(np.int64))).roll(1, dims=1)
-    scales = torch.lerp(*ends[0], floats(rows["scales"]) / MOST_SCALE)
+    scales = torch.lerp(ends[0][0], ends[0][1], floats(rows["scales"]) / MOST_SCALE)
     sh = sh_of_colour(floats(rows["rgba"][:, :3]) / MAX_BYTE)[:, None]
     if len(ends) > 1:
         packed = read_harmonics(start, stop)["sh"]
         values = floats((packed[:, :COEFFICIENTS, None] >> SHIFTS & MOST) / MOST)
-        sh = torch.cat([sh, torch.lerp(*ends[1], values)], dim=1)
+        sh = torch.cat([sh, torch.lerp(ends[1][0], ends[1][1], values)], dim=1)
     return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
 
 

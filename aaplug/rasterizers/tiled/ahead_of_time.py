@@ -33,7 +33,7 @@ from typing import Any
 import platformdirs
 import torch
 
-from aaplug.core import culling, projection, shading
+from aaplug.core import ellipses, projection, shading
 from aaplug.core.interfaces import RunsOwnKernels
 from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
 from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
@@ -53,7 +53,7 @@ from aaplug.system.monitor import Tell
 IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
     projection.PROJECT,
     *map(shading.shade_kernel, shading.COMPILED_COEFFICIENTS),
-    culling.CULL,
+    ellipses.CULL,
     binning.TABLE,
     binning.SPANS,
     binning.PAIRS,
