@@ -14,7 +14,6 @@ from aaplug.io.values import read_bounded
 from aaplug.system.errors import FormatError
 
 MAX_SIZE = 2**20  # bytes: thousands of scenes
-SCENES_KEY = "scene"
 PATH_KEYS = ("scene", "model_path", "cameras", "output", "lpips")
 
 
@@ -30,7 +29,7 @@ def read_batch(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, dic
         document = tomllib.loads(read_bounded(path, MAX_SIZE).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise FormatError(path, f"should be TOML: {error}") from error
-    tables = document.pop(SCENES_KEY, None)
+    tables = document.pop("scene", None)
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise FormatError(path, "names no scene; it needs a [[scene]] table for each")
     scenes: dict[str, dict[str, Any]] = {}

@@ -6,7 +6,7 @@ readers: counts that allocate terabytes, decompression bombs, endless headers.
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,9 +90,15 @@ def usable_memory() -> Memory | None:
     with suppress(AttributeError, ValueError, OSError):
         machine = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
         candidates.append(Memory(machine, "this machine's {}"))
-    for path in _files_of_control_groups():
-        with suppress(OSError, ValueError):  # "max", or it is not there
-            candidates.append(Memory(float(path.read_text()), "this container's {}"))
+    for line in CONTROL_GROUPS.read_text().splitlines() if CONTROL_GROUPS.exists() else []:
+        _, controllers, place = line.split(":", 2)
+        if controllers == "" or "memory" in controllers.split(","):  # of version 2 or 1 of Linux's control groups
+            root, name = (CGROUP / "memory", "memory.limit_in_bytes") if controllers else (CGROUP, "memory.max")
+            inner = root / place.lstrip("/")
+            for folder in (inner, *inner.parents):  # those above limit it too
+                with suppress(OSError, ValueError):  # "max", or it is not there
+                    if folder.is_relative_to(root):
+                        candidates.append(Memory(float((folder / name).read_text()), "this container's {}"))
     with suppress(ImportError, OSError):
         import resource
 
@@ -102,14 +108,3 @@ def usable_memory() -> Memory | None:
             left = max(0.0, float(most - pages * os.sysconf("SC_PAGE_SIZE")))
             candidates.append(Memory(left, "the {} that `ulimit -v` leaves"))
     return min(candidates, default=None)
-
-
-def _files_of_control_groups() -> Iterator[Path]:
-    """Files that may limit this process's memory, by version 1 or 2 of Linux's control groups, and those above it."""
-    lines = CONTROL_GROUPS.read_text().splitlines() if CONTROL_GROUPS.exists() else []
-    for line in lines:
-        _, controllers, place = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):
-            root, name = (CGROUP / "memory", "memory.limit_in_bytes") if controllers else (CGROUP, "memory.max")
-            inner = root / place.lstrip("/")
-            yield from (folder / name for folder in (inner, *inner.parents) if folder.is_relative_to(root))

@@ -10,7 +10,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -62,18 +62,16 @@ def scratch(parent: str | None = None) -> Iterator[Path]:
     parent: the folder that it is in; None for the system's.
     """
     while True:
-        with tempfile.TemporaryDirectory(prefix=SCRATCH_PREFIX, dir=parent, ignore_cleanup_errors=True) as name:
+        temporary = tempfile.TemporaryDirectory(prefix=SCRATCH_PREFIX, dir=parent, ignore_cleanup_errors=True)
+        with temporary as name, ExitStack() as stack:
             folder = Path(name)
-            mark = os.open(folder / LOCK_FILE_NAME, os.O_RDWR | os.O_CREAT, 0o600)
             try:
-                lock(mark, wait=True)
-                if not _is_at(mark, folder / LOCK_FILE_NAME):
-                    continue
-                remove_left(folder.parent)
-                yield folder
-                return
-            finally:
-                os.close(mark)
+                stack.enter_context(new_file(folder / LOCK_FILE_NAME))
+            except FileNotFoundError:  # removed before it was locked
+                continue
+            remove_left(folder.parent)
+            yield folder
+            return
 
 
 @cache

@@ -35,7 +35,6 @@ FILE = "transforms.json"
 STEREO = ("OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
-LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 FISHEYE = "OPENCV_FISHEYE"
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -139,7 +138,7 @@ def _document(file: Path) -> dict[str, Any]:
             hint = f"give nerfstudio's transforms.json, with the run's {DATAPARSER} beside it"
             raise FormatError(file, f"{lacks}; {hint}")
         rows = row[EXPORTED]
-        frames.append({**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows})
+        frames.append({**row, "transform_matrix": [*rows, [0.0, 0.0, 0.0, 1.0]] if isinstance(rows, list) else rows})
     return {"frames": frames}
 
 

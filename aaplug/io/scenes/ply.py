@@ -34,7 +34,6 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", "rot_2", "rot_3"))
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
 EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
-FLOAT_CODES = ("f4", "f8")
 ROWS_PER_PART = 1 << 16  # 16 MB of a scene of degree 3: few calls, and little memory beside the result
 ROWS_PER_CONVERSION = 1 << 12  # 1 MB, so that a column's stride stays within the cache
 ROWS_PER_WRITE = 1 << 16  # 16 MB
@@ -105,7 +104,7 @@ def _check_columns(header: Header) -> list[str]:
         lacks = f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has"
         raise FormatError(header.path, f"{lacks}; is it a point cloud or a mesh?")
     used = [p for p in vertex.properties if _is_parameter(p.name)]
-    wrong = [p.name for p in used if p.code not in FLOAT_CODES]
+    wrong = [p.name for p in used if p.code not in ("f4", "f8")]
     if wrong:
         raise FormatError(header.path, f"{listing(wrong)} must be float; convert the file to float32")
     rest = _rest(header)

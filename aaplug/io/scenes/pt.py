@@ -20,9 +20,9 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import DEGREES
+from aaplug.io.scenes.ply_tags import run_config
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.scenes.training_config import run_config
 from aaplug.system.errors import FormatError
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
