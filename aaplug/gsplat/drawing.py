@@ -1,9 +1,9 @@
-"""One image by gsplat's rules: which splats it keeps, their channels, and absolute gradients.
+"""One image by gsplat's rules: which splats it keeps, and their channels.
 
 m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -23,23 +23,14 @@ from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
-from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
-from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rendering import passes
-from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
-CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
-# With gradients, torch's compiler fails on four channels; a part without a gradient, as of unused depth, costs nothing.
-CHANNELS_PER_CALL_WITH_GRADIENTS = (3,)
 MIN_ALPHA_OF_DEPTH = 1e-10  # expected depth is divided by no less
 
 _EMPTY = torch.zeros(0)
 NO_BOUNDS = SamplingBounds(_EMPTY, _EMPTY, _EMPTY, _EMPTY.int())
-
-Image = tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]
-AddGradient = Callable[[Float[Tensor, "m 2"]], object]
 
 
 def splats_of(view: View, options: Options, kernels: Kernels) -> tuple[Splats2D, Int[Tensor, "m 2"]]:
@@ -76,29 +67,6 @@ def splats_of(view: View, options: Options, kernels: Kernels) -> tuple[Splats2D,
     return splats, radii[keep].int()
 
 
-@on_free_cores()
-def draw(
-    splats: Splats2D,
-    view: View,
-    options: Options,
-    rasterizer: Rasterizer,
-    kernels: Kernels,
-    add_gradient: AddGradient | None,
-) -> Image:
-    """Colours and depth, as far as `render_mode` draws them, and alpha.
-
-    Depth, the last channel, has no background and may be divided by alpha.
-
-    add_gradient: called in the backward pass with the absolute gradients of the centres, unless it is None.
-    """
-    features = features_of(splats, view, options, kernels)
-    pixel = POINT if add_gradient is None else AbsolutePoint(absolute_gradients_to=add_gradient)
-    tracked = torch.is_grad_enabled() and (splats.means.requires_grad or features.requires_grad)
-    per_call = CHANNELS_PER_CALL_WITH_GRADIENTS if tracked else CHANNELS_PER_CALL
-    image, alpha = composited(splats, features, options, rasterizer, pixel, per_call)
-    return finished(image, alpha, view, options), alpha
-
-
 def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels) -> Float[Tensor, "m d"]:
     """Colours and depth of each splat, as far as `render_mode` draws them."""
     parts = []
@@ -118,7 +86,7 @@ def composited(
     rasterizer: Rasterizer,
     pixel: PixelKernel,
     per_call: Sequence[int],
-) -> Image:
+) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]:
     """Premultiplied channels, and alpha.  per_call: the numbers of channels of which one is drawn at a time."""
     rules = options.convention.rules
     image = passes.composited(

@@ -14,15 +14,21 @@ from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.drawing import draw, splats_of
+from aaplug.gsplat.drawing import composited, features_of, finished, splats_of
 from aaplug.gsplat.table import Layout, conics
+from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers.choice import kernels_of
 from aaplug.system.contracts import Range, contract
+from aaplug.system.cores import on_free_cores
 
 Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
 Kernel = Annotated[float, Range(0, MAX_KERNEL)]
 MaxAlpha = Annotated[float, Range(above=RULES_GSPLAT.min_alpha, most=1 - 1e-6)]
+CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
+# With gradients, torch's compiler fails on four channels; a part without a gradient, as of unused depth, costs nothing.
+CHANNELS_PER_CALL_WITH_GRADIENTS = (3,)
 
 
 @contract
@@ -143,9 +149,15 @@ def rasterization(
     columns = zip(splats, *(layout.split(meta[name]) for name in ("means2d", "depths", "opacities")), strict=True)
     splats = [replace(part, means=means, depths=z, opacities=opacity) for part, means, z, opacity in columns]
     adders = layout.gradient_adders(meta["means2d"]) if absgrad else len(views) * [None]
-    images = [
-        draw(part, view, options, painter, kernels, add) for part, view, add in zip(splats, views, adders, strict=True)
-    ]
+    images = []
+    for part, view, add in zip(splats, views, adders, strict=True):
+        with on_free_cores():
+            features = features_of(part, view, options, kernels)
+            pixel = POINT if add is None else AbsolutePoint(absolute_gradients_to=add)
+            tracked = torch.is_grad_enabled() and (part.means.requires_grad or features.requires_grad)
+            per_call = CHANNELS_PER_CALL_WITH_GRADIENTS if tracked else CHANNELS_PER_CALL
+            image, alpha = composited(part, features, options, painter, pixel, per_call)
+            images.append((finished(image, alpha, view, options), alpha))
     colours, alphas = (
         torch.stack([image.contiguous() for image in column]).unflatten(0, layout.shape)
         for column in zip(*images, strict=True)

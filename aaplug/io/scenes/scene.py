@@ -92,19 +92,12 @@ class Scene:
         """
         check_values(held.scene if isinstance(held, Pyramid) else held)
         finest, levels = (held.finest, held) if isinstance(held, Pyramid) else (held, None)
-        origin = finest.origin
-        scene = cls(
-            path=None,
-            format="levels" if levels is not None else "" if origin is None else origin.format,
-            count=len(finest),
-            sh_degree=finest.sh_degree,
-            load=lambda start, stop: finest[start:stop],
-            evidence="" if origin is None else origin.evidence,
-            convention=finest.convention,
-            fused=finest.fused,
-            flat=finest.flat,
-            document=None if origin is None else origin.document,
-        )
+        facts = finest.convention, finest.fused, finest.flat
+        format, evidence, document = "", "", None
+        if (origin := finest.origin) is not None:
+            format, evidence, document = origin.format, origin.evidence, origin.document
+        format = format if levels is None else "levels"
+        scene = cls(None, format, len(finest), finest.sh_degree, _Rows(finest), evidence, *facts, document)
         scene.memory.update(gaussians=finest, levels=levels)
         return scene
 
