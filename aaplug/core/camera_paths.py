@@ -103,10 +103,6 @@ def between(first: Camera, last: Camera, share: float) -> Camera:
 
 def toward(first: Camera, last: Camera, share: float) -> Camera:
     """As `between`, with the lens on its way too: focal lengths even in octaves, the principal point on a line."""
-    focal = {
-        name: getattr(first, name) * (getattr(last, name) / getattr(first, name)) ** share for name in ("fx", "fy")
-    }
-    middle = {
-        name: getattr(first, name) + share * (getattr(last, name) - getattr(first, name)) for name in ("cx", "cy")
-    }
-    return replace(between(first, last, share), **focal, **middle)
+    fx, fy = (a * (b / a) ** share for a, b in ((first.fx, last.fx), (first.fy, last.fy)))
+    cx, cy = (a + share * (b - a) for a, b in ((first.cx, last.cx), (first.cy, last.cy)))
+    return replace(between(first, last, share), fx=fx, fy=fy, cx=cx, cy=cy)

@@ -84,8 +84,7 @@ class GltfFormat:
         check_count(path, count)
         notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
         load, others = partial(rows_of, [(part.count, part.load) for part in parts], degree), tuple(document.files)
-        said = {"convention": facts.convention, "fused": facts.fused, "others": others}
-        return Scene(path, self.name, count, degree, load, facts.evidence, notes=tuple(filter(None, notes)), **said)
+        return Scene(path, self.name, count, degree, load, *facts, notes=tuple(filter(None, notes)), others=others)
 
     def write(
         self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions

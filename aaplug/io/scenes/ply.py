@@ -60,7 +60,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
     load, notes = partial(_rows, document, degree, said.flat), (*notes, *([note] if note else ()))
-    return Scene(path, name, header.vertex.count, degree, load, **vars(said), document=document, notes=notes)
+    return Scene(path, name, header.vertex.count, degree, load, *said, document=document, notes=notes)
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:

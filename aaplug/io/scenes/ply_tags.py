@@ -14,13 +14,13 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import re
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import Fusion
 from aaplug.io.scenes.columns import FILTER_COLUMN
 from aaplug.io.scenes.ply_header import Header
+from aaplug.io.scenes.record import Facts
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST
 from aaplug.io.values import HEAD_LIMIT, read_start
 from aaplug.system.errors import FormatError
@@ -45,17 +45,7 @@ RUN_MODES = {b"antialiased": ANTIALIASED, b"true": ANTIALIASED, b"classic": CLAS
 MODES = {"mip": COMPENSATED, "antialiased": ANTIALIASED, "default": CLASSIC}
 
 
-@dataclass(frozen=True)
-class Meaning:
-    """The statements of a header; evidence: their source, for the user."""
-
-    convention: Convention
-    evidence: str
-    fused: tuple[Fusion, ...]
-    flat: bool = False
-
-
-def meaning(header: Header, compressed: bool = False) -> Meaning:
+def meaning(header: Header, compressed: bool = False) -> Facts:
     """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
     records = list[dict[str, str]]()
     for words in _matches(header, RECORD):
@@ -71,14 +61,14 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
     flat = two_scales or bool(mode and mode.lower() == FLAT_MODE)
     stated = [record["convention"] for record in records if "convention" in record]
     if not stated:
-        return Meaning(*_from_others(header, mode, two_scales), fused, flat)
+        return Facts(*_from_others(header, mode, two_scales), fused, flat)
     if stated[-1] not in CONVENTIONS:
         names = ", ".join(CONVENTIONS)
         raise FormatError(header.path, f"its aaplug comment has convention={stated[-1]}; known are {names}")
-    return Meaning(CONVENTIONS[stated[-1]], f"aaplug's record in the file: {stated[-1]}", fused, flat)
+    return Facts(f"aaplug's record in the file: {stated[-1]}", CONVENTIONS[stated[-1]], fused, flat)
 
 
-def meaning_in_run(header: Header) -> tuple[Meaning, str | None]:
+def meaning_in_run(header: Header) -> tuple[Facts, str | None]:
     """The header's meaning, or, without a tag, that of the run that holds the file; and a note if that says nothing."""
     said = meaning(header)
     if not said.evidence.startswith(UNTAGGED):
@@ -86,7 +76,7 @@ def meaning_in_run(header: Header) -> tuple[Meaning, str | None]:
     is_nerfstudio = bool(_matches(header, NERFSTUDIO))
     statement = run_config(Path(header.path), is_nerfstudio)
     if statement is not None:
-        return replace(said, convention=statement[0], evidence=statement[1]), None
+        return said._replace(evidence=statement.evidence, convention=statement.convention), None
     return said, NERFSTUDIO_NOTE if is_nerfstudio else None
 
 
@@ -110,25 +100,25 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
     return header
 
 
-def _from_others(header: Header, mode: str | None, two_scales: bool) -> tuple[Convention, str]:
-    """The convention that others' tags and columns state, and the evidence."""
+def _from_others(header: Header, mode: str | None, two_scales: bool) -> tuple[str, Convention]:
+    """The evidence of others' tags and columns, and the convention that they state."""
     postshot = _last(header, POSTSHOT_TAG)
     if FILTER_COLUMN in header.vertex.names:
-        return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
+        return f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused", MIP
     if mode is not None and mode.lower() == FLAT_MODE:
-        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic"
+        return f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic", CLASSIC
     if mode is None and two_scales:
-        return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), treated as classic"
+        return "two scales in the file: 2D Gaussians (2DGS), treated as classic", CLASSIC
     if mode is not None and mode.lower() in MODES:
         lost = f"; {KERNEL_LOST}" if mode.lower() == "mip" else ""
-        return MODES[mode.lower()], f"tag in the file: SplatRenderMode: {mode}{lost}"
+        return f"tag in the file: SplatRenderMode: {mode}{lost}", MODES[mode.lower()]
     if mode is not None:
-        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic"
+        return f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic", CLASSIC
     if postshot is not None:
-        return (ANTIALIASED if postshot == "1" else CLASSIC), f"tag in the file: antialiased {postshot}"
+        return f"tag in the file: antialiased {postshot}", ANTIALIASED if postshot == "1" else CLASSIC
     if _matches(header, NERFSTUDIO):
-        return CLASSIC, f"{UNTAGGED}nerfstudio writes none, it may be classic or antialiased; assumed classic"
-    return CLASSIC, f"{UNTAGGED}assumed classic (3DGS default)"
+        return f"{UNTAGGED}nerfstudio writes none, it may be classic or antialiased; assumed classic", CLASSIC
+    return f"{UNTAGGED}assumed classic (3DGS default)", CLASSIC
 
 
 def _matches(header: Header, pattern: re.Pattern[str]) -> list[str]:
@@ -148,7 +138,7 @@ def _fused_line(fusion: Fusion, convention: Convention) -> str:
     return "aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items())
 
 
-def run_config(scene: Path, nerfstudio: bool = False) -> tuple[Convention, str] | None:
+def run_config(scene: Path, nerfstudio: bool = False) -> Facts | None:
     """The convention in the configuration of the run that holds the scene, and the evidence; None if it has none.
 
     nerfstudio's exporter and gsplat's trainer write no tag, but their runs keep a YAML file: nerfstudio's config.yml
@@ -167,4 +157,4 @@ def run_config(scene: Path, nerfstudio: bool = False) -> tuple[Convention, str] 
     except FormatError:  # it is not there, or cannot be read
         return None
     convention = RUN_MODES.get(values.pop()) if len(values) == 1 else None  # the one value that all such lines have
-    return None if convention is None else (convention, f"{config.name} of its run says {convention.name}")
+    return None if convention is None else Facts(f"{config.name} of its run says {convention.name}", convention)

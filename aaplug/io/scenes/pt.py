@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.ply_tags import run_config
+from aaplug.io.scenes.record import Facts
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
@@ -28,7 +28,7 @@ from aaplug.system.errors import FormatError
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
-UNKNOWN = CLASSIC, "neither the format nor a cfg.yml in the folder above says: assumed classic"
+UNKNOWN = Facts("neither the format nor a cfg.yml in the folder above says: assumed classic")
 
 name = "pt"
 
@@ -66,8 +66,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     for key, tensor in splats.items():
         _check(path, key, tensor, count, size)
     degree = DEGREES[3 * splats["shN"].shape[1]]
-    convention, evidence = run_config(path) or UNKNOWN
-    return Scene(path, name, count, degree, partial(_rows, splats), evidence, convention)
+    return Scene(path, name, count, degree, partial(_rows, splats), *(run_config(path) or UNKNOWN))
 
 
 def _splats(path: Path, document: Any) -> dict[str, Tensor]:

@@ -25,11 +25,12 @@ log = logging.getLogger("aaplug")
 
 
 class Facts(NamedTuple):
-    """What a file says about its scene; evidence: where, for the user."""
+    """What a file says about its scene; evidence: where, for the user.  flat: see `Gaussians`."""
 
     evidence: str
     convention: Convention = CLASSIC
     fused: tuple[Fusion, ...] = ()
+    flat: bool = False
 
 
 def record_of(scene: Gaussians) -> dict[str, Any]:
@@ -53,7 +54,7 @@ def read_record(path: Path, holder: dict[str, Any], otherwise: Facts) -> Facts:
         settings = fusion.entry("settings").fields
         pairs = {text(k, record.place, "a setting"): text(v, record.place, "a setting") for k, v in settings.items()}
         fused.append(Fusion(fusion.get("method", text), pairs))
-    return Facts(f"aaplug's record in the file: {name}", CONVENTIONS[name], tuple(fused))
+    return Facts(f"aaplug's record in the file: {name}", CONVENTIONS[name], tuple(fused), otherwise.flat)
 
 
 def holdable(path: Path, part: Gaussians, format: str, degree: int, flat: bool = False) -> Gaussians:

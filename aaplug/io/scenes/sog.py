@@ -140,13 +140,11 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
         raise root.place.error(f"{lacking[0]} is missing")
     palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
-    said, flat = _meaning(meta)
-    said = read_record(path, meta, said)
-    load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
+    facts = read_record(path, meta, _meaning(meta))
+    load, notes = partial(_rows, parts, palette, version, facts.flat), (f"version {version}",)
     files = [file for part in parts.values() for file in part.entry.value("files")] if _is_meta(path) else []
     others = tuple(path.parent / file for file in files)
-    facts = {"flat": flat, "notes": notes, "others": others}
-    return Scene(path, name, count, degree, load, *said, **facts)
+    return Scene(path, name, count, degree, load, *facts, notes=notes, others=others)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
@@ -178,16 +176,16 @@ def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) 
         return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
 
 
-def _meaning(meta: dict[str, Any]) -> tuple[Facts, bool]:
+def _meaning(meta: dict[str, Any]) -> Facts:
     model = meta.get("model")
     if model is None:
-        return Facts("no model in meta.json: assumed classic (3DGS default)"), False
+        return Facts("no model in meta.json: assumed classic (3DGS default)")
     said = f"model in meta.json: {json.dumps(model)[:40]}"
     if model == "antialiased":
-        return Facts(f"{said}; {KERNEL_LOST}", COMPENSATED), False
+        return Facts(f"{said}; {KERNEL_LOST}", COMPENSATED)
     if model == "2dgs":
-        return Facts(f"{said}: 2D Gaussians, taken for classic"), True
-    return Facts(said + ("" if model == "default" else " is unknown: assumed classic")), False
+        return Facts(f"{said}: 2D Gaussians, taken for classic", flat=True)
+    return Facts(said + ("" if model == "default" else " is unknown: assumed classic"))
 
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
