@@ -16,7 +16,6 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from os import PathLike
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,7 +28,7 @@ from torch import Tensor
 
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import levels
-from aaplug.io.atomic import replacing
+from aaplug.io.atomic import AnyPath, replacing
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import contract
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of
@@ -52,15 +51,13 @@ STDERR = 2  # file descriptor, which the codecs write to directly
 log = logging.getLogger("aaplug")
 
 
-def image_size(path: str | PathLike[str]) -> tuple[int, int]:
+def image_size(path: AnyPath) -> tuple[int, int]:
     """Width and height in px as stored, from the header alone."""
     return _look(Path(path))[0]
 
 
 @contract
-def read_image(
-    path: str | PathLike[str], background: tuple[float, float, float] | None = None
-) -> Float[Tensor, "h w 3"]:
+def read_image(path: AnyPath, background: tuple[float, float, float] | None = None) -> Float[Tensor, "h w 3"]:
     """Read an 8- or 16-bit image; a transparent one is composited over `background` in float, and refused if None."""
 
     def composited(rows: Tensor) -> Tensor:
@@ -74,7 +71,7 @@ def read_image(
     return _read(Path(path), 3, composited)
 
 
-def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
+def read_rgba(path: AnyPath) -> Float[Tensor, "h w 4"]:
     """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none."""
 
     def with_alpha(rows: Tensor) -> Tensor:
@@ -84,9 +81,7 @@ def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
 
 
 @contract
-def write_png(
-    path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
-) -> None:
+def write_png(path: AnyPath, rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False) -> None:
     """Write colours, clamped to [0, 1], as a PNG of 8 or 16 bits.
 
     Raises:

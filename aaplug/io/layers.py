@@ -7,7 +7,6 @@ from finished pixels, once: scenes are composited in the display values that tra
 
 import errno
 from collections.abc import Mapping
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from aaplug.core.imaging import linear, straight
 from aaplug.core.passes import PASSES
-from aaplug.io.atomic import replacing, replacing_file
+from aaplug.io.atomic import AnyPath, replacing, replacing_file
 from aaplug.io.image_formats import COLOURS, Storage
 from aaplug.io.images import encoded
 from aaplug.system.contracts import contract
@@ -28,7 +27,7 @@ MAX_HALF = 65504.0  # the largest finite half
 
 @contract
 def write_layers(
-    path: str | PathLike[str],
+    path: AnyPath,
     layers: Mapping[str, Float[Tensor, "h w ..."] | Int[Tensor, "h w"]],
     storage: Storage,
     overwrite: bool = False,
@@ -67,7 +66,7 @@ def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -
 
 
 def _write_exr(
-    path: str | PathLike[str], layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool
+    path: AnyPath, layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool
 ) -> None:
     """Write a file of named layers, as Blender and Nuke read them: R, G, B, A, depth.Z, normal.X ..."""
     import OpenEXR  # an extra

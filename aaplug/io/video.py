@@ -6,7 +6,6 @@ of an odd side is repeated, and no pixel is resampled.  A video appears whole or
 
 from collections.abc import Iterable
 from fractions import Fraction
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from aaplug.core.imaging import levels
 from aaplug.io import MOST_FPS
-from aaplug.io.atomic import check_output, replacing_file
+from aaplug.io.atomic import AnyPath, check_output, replacing_file
 from aaplug.io.images import checked_image
 from aaplug.system.errors import OutputError, UsageError
 
@@ -35,7 +34,7 @@ MAX_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
 BIT_EXACT = {"fflags": "+bitexact"}  # no random track number, no version: the same frames make the same file
 
 
-def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
+def check_video(path: AnyPath, fps: float, overwrite: bool) -> None:
     """Refuse a video that cannot be written, before any work.
 
     Raises:
@@ -49,9 +48,7 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
     check_output(path, overwrite)
 
 
-def write_video(
-    path: str | PathLike[str], frames: Iterable[Float[Tensor, "h w 3"]], fps: float, overwrite: bool = False
-) -> None:
+def write_video(path: AnyPath, frames: Iterable[Float[Tensor, "h w 3"]], fps: float, overwrite: bool = False) -> None:
     """Write a video of at least one frame; errors as in `check_video`, and OutputError if it cannot be written."""
     check_video(path, fps, overwrite)
     import av  # it loads FFmpeg

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -21,7 +20,7 @@ from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io import STREAM_INDEXES
-from aaplug.io.atomic import check_output
+from aaplug.io.atomic import AnyPath, check_output
 from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.faults import described_faults, faults_of
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
@@ -96,7 +95,7 @@ OWN: tuple[SceneFormat, ...] = (
     *chunked.FORMATS,
 )
 SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
-SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
+SceneLike = Scene | Gaussians | Pyramid | AnyPath
 
 
 def scene_of(scene: SceneLike, still: bool = False) -> Scene:
@@ -115,7 +114,7 @@ def scene_of(scene: SceneLike, still: bool = False) -> Scene:
 
 @contract
 def read_scene(
-    path: str | PathLike[str],
+    path: AnyPath,
     *,
     iteration: int | None = None,
     convention: Convention | None = None,
@@ -180,12 +179,7 @@ def read_scene(
 
 @contract
 def write_scene(
-    path: str | PathLike[str],
-    scene: Gaussians,
-    *,
-    overwrite: bool = False,
-    spz_axes: SpzAxes = "auto",
-    spz_version: SpzVersion = 4,
+    path: AnyPath, scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "auto", spz_version: SpzVersion = 4
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
@@ -201,10 +195,10 @@ def write_scene(
 
 
 def write_parts(
-    path: str | PathLike[str],
+    path: AnyPath,
     parts: Iterable[Gaussians],
     count: int,
-    inputs: Iterable[str | PathLike[str]] = (),
+    inputs: Iterable[AnyPath] = (),
     *,
     overwrite: bool = False,
     spz_axes: SpzAxes = "auto",
@@ -219,7 +213,7 @@ def write_parts(
     writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version))
 
 
-def _storable(path: str | PathLike[str], parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:
+def _storable(path: AnyPath, parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:
     """The parts as float32 on the CPU; raises OutputError for values that no renderer can use."""
     for place, part in enumerate(parts):
         if part.extras and not keeps_extras and not place:
@@ -230,7 +224,7 @@ def _storable(path: str | PathLike[str], parts: Iterable[Gaussians], keeps_extra
         yield part
 
 
-def written_format(path: str | PathLike[str]) -> WritableFormat | None:
+def written_format(path: AnyPath) -> WritableFormat | None:
     """The format that writes files of this suffix; None if none does."""
     name = Path(path).name.lower()
     named = [format for format in SCENE_FORMATS.values() if f".{name}".endswith("." + format.name)]
@@ -238,9 +232,7 @@ def written_format(path: str | PathLike[str]) -> WritableFormat | None:
     return found if isinstance(found, WritableFormat) else None
 
 
-def check_scene_output(
-    path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()
-) -> WritableFormat:
+def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> WritableFormat:
     """The format that will write `path`; refuses an output that cannot be written, before any work.
 
     Errors: see `write_scene`.
@@ -256,7 +248,7 @@ def check_scene_output(
     return writer
 
 
-def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
+def find_scene(path: AnyPath, iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
     A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images or chunks,

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ from torch import Tensor
 from aaplug.core.chunks import chunks_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
-from aaplug.io.atomic import replacing
+from aaplug.io.atomic import AnyPath, replacing
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.values import entries, natural, number, object_of, read_json, text
@@ -80,12 +79,12 @@ def pyramid_of(levels: Sequence[Level]) -> Pyramid:
     return Pyramid.of([level.scene for level in levels], chunks)
 
 
-def is_pyramid(folder: str | PathLike[str]) -> bool:
+def is_pyramid(folder: AnyPath) -> bool:
     """True for a folder that holds a pyramid, finished or not."""
     return (Path(folder) / MANIFEST).is_file()
 
 
-def read_manifest(folder: str | PathLike[str], unfinished: bool = False) -> Manifest:
+def read_manifest(folder: AnyPath, unfinished: bool = False) -> Manifest:
     """Read lod.json; one that lists fewer levels than were asked for is refused unless `unfinished` allows it.
 
     Raises:
@@ -110,7 +109,7 @@ def read_manifest(folder: str | PathLike[str], unfinished: bool = False) -> Mani
     return Manifest(about.get("source", text), largest, count, tuple(levels))
 
 
-def read_pyramid(folder: str | PathLike[str]) -> Pyramid:
+def read_pyramid(folder: AnyPath) -> Pyramid:
     """Read a folder that `aaplug.lod` wrote.
 
     Raises:
@@ -119,7 +118,7 @@ def read_pyramid(folder: str | PathLike[str]) -> Pyramid:
     return pyramid_of(list(levels_in(folder, read_manifest(folder))))
 
 
-def levels_in(folder: str | PathLike[str], manifest: Manifest, start: int = 0) -> Iterator[Level]:
+def levels_in(folder: AnyPath, manifest: Manifest, start: int = 0) -> Iterator[Level]:
     """The levels of a folder from `start` on; see `read_pyramid`.  The files of those before it are checked, too."""
     for place, entry in enumerate(manifest.levels):
         path = path_of(Path(folder), entry)
@@ -137,7 +136,7 @@ def levels_in(folder: str | PathLike[str], manifest: Manifest, start: int = 0) -
         yield Level(scene, entry.rate, chunks)
 
 
-def write_manifest(folder: str | PathLike[str], manifest: Manifest) -> None:
+def write_manifest(folder: AnyPath, manifest: Manifest) -> None:
     """Write lod.json, replacing it; raises OutputError if it cannot be written."""
     with replacing(Path(folder) / MANIFEST, overwrite=True) as stream:
         stream.write(json.dumps({KEY: VERSION, **asdict(manifest)}).encode())
