@@ -18,28 +18,14 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
-from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import rows_of
-from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.packed import Piece, rows_of
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
 from aaplug.system.errors import FormatError, counted
 
 HEAD_BYTES = 64  # of a chunk, which tell its format
 TRAILING_COMMA = re.compile(rb",(\s*[}\]])")  # some writers of .lcc2 leave one at the end of a list
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Rows of a chunk, as `rows_of` joins them."""
-
-    chunk: Scene
-    start: int
-    count: int
-
-    def load(self, start: int, stop: int) -> Gaussians:
-        """Those from start up to stop."""
-        return self.chunk.load(self.start + start, self.start + stop)
 
 
 @dataclass
@@ -67,12 +53,13 @@ class Chunks:
             raise FormatError(self.path, f"names {name!r}, which is neither a SOG nor a .spz")
         return self.opened[name]
 
-    def rows(self, names: list[str], entry: Entry, key: str, start: str) -> Rows:
+    def rows(self, names: list[str], entry: Entry, key: str, start: str) -> Piece:
         """The rows that an entry names by the number of the file, their first one and how many, or all from there."""
         chunk = self.open(names[natural(entry.value(key), entry.place, key, len(names) - 1)])
         first = natural(entry.fields.get(start, 0), entry.place, start, chunk.count)
         left = chunk.count - first
-        return Rows(chunk, first, natural(entry.fields.get("count", left), entry.place, "count", left))
+        count = natural(entry.fields.get("count", left), entry.place, "count", left)
+        return count, lambda start, stop: chunk.load(first + start, first + stop)
 
 
 @dataclass(frozen=True)
@@ -83,7 +70,7 @@ class ChunkedFormat:
     """
 
     name: str
-    pieces: Callable[[Entry, Chunks], list[Rows]]
+    pieces: Callable[[Entry, Chunks], list[Piece]]
     turned: Callable[[Gaussians], Gaussians] = lambda scene: scene
     notes: tuple[str, ...] = ()
 
@@ -96,7 +83,7 @@ class ChunkedFormat:
         with library_errors(path):
             data, chunks = TRAILING_COMMA.sub(rb"\1", read_bounded(path, whole_limit("JSON"))), Chunks(path, options)
             pieces = self.pieces(object_of(parse_json(data, path), path, "its tree", "a tree of chunks"), chunks)
-        opened, count = [*chunks.opened.values()], sum(piece.count for piece in pieces)
+        opened, count = [*chunks.opened.values()], sum(count for count, _ in pieces)
         held = sum(chunk.count for chunk in opened)
         if count > held or not opened:
             raise FormatError(path, f"names {count:,} Gaussians in files that hold {held:,}")
@@ -133,18 +120,18 @@ def _names(value: object, place: Place, field: str) -> list[str]:
     return [text(each, place, field) for each in value] if isinstance(value, list) else []
 
 
-def _streamed_sog(root: Entry, chunks: Chunks) -> list[Rows]:
+def _streamed_sog(root: Entry, chunks: Chunks) -> list[Piece]:
     version, names = root.value("version"), root.get("filenames", _names)
     root.place.expect(version == 1, "version", "1", version)
     levels = [node.entry("lods") for node, _ in _nodes(root.entry("tree"), "children") if "lods" in node]
     pieces = [chunks.rows(names, level.entry("0"), "file", "offset") for level in levels if "0" in level]
     if "environment" in root:
         far = chunks.open(root.get("environment", text))
-        pieces.append(Rows(far, 0, far.count))
+        pieces.append((far.count, far.load))
     return pieces
 
 
-def _lcc2(root: Entry, chunks: Chunks) -> list[Rows]:
+def _lcc2(root: Entry, chunks: Chunks) -> list[Piece]:
     tree = root.entry("root")
     names = tree.get("splatFiles" if "splatFiles" in tree else "files", _names)
     leaves = [node.entry("data") for node, leaf in _nodes(tree, "child") if leaf and "data" in node]
