@@ -286,9 +286,7 @@ def info(words: Words) -> Answer:
     """
     if words.limits:
         return _limits()
-    scene = open_scene(words)
-    cameras = words.of(Orbit) if words.cameras is None else read_cameras(words, scene)
-    facts = aaplug.info(scene, cameras, **told(words, FrameOptions))
+    facts = aaplug.info(*read_inputs(words), **told(words, FrameOptions))
     shown = {key: value for key, value in facts.items() if key not in PROGRAM_KEYS and value != []}
     names = [key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ") for key in shown]
     return Answer(facts, [table(zip(names, map(_text, shown.values()), strict=True))])

@@ -10,7 +10,7 @@ import torch
 from aaplug.io.scenes import write_scene
 from aaplug.verbs.info import info
 from tests.conftest import make_scene
-from tests.test_cli import break_nan
+from tests.test_cli import break_nan, inria_model
 
 BOTH_MODES = b"comment SplatRenderMode: mip\ncomment SplatRenderMode: default\nelement vertex"
 
@@ -30,6 +30,15 @@ def test_info_with_cameras_tells_the_sampling(cli):
     assert 0 < shares["matched"]["at 1"] < shares["matched"]["at 1/8"] < 1
     assert json.loads(cli("info scene.ply --cameras . --json")[1]) == facts
     assert f"at 1/8: {shares['auto']['at 1/8']:.4g}" in " ".join(cli("info scene.ply --cameras .")[1].split())
+
+
+def test_info_of_a_model_folder_tells_the_sampling_of_its_cameras(cli):
+    model = inria_model(Path("model"), "Namespace(eval=False)")
+    facts = info(model)
+    assert facts["training_cameras"] == 2
+    assert "training_rate" not in facts
+    assert json.loads(cli(f"info {model} --json")[1]) == facts
+    cli.refused(f"info {model} --orbit 4", "--orbit: is for scenes without cameras")
 
 
 def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):

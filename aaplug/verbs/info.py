@@ -37,8 +37,8 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
 
     Args:
         scene: a scene's file or a model folder.
-        cameras: training cameras, their file or folder, to tell also how finely they sample the scene.  None, or an
-            `Orbit`: what can be told without, under its assumption.
+        cameras: training cameras, their file or folder, to tell also how finely they sample the scene; None for those
+            of its model folder.  Where it has none, or for an `Orbit`: what can be told without, under its assumption.
 
     Returns:
         JSON-ready facts by name; "problems" lists what is odd, each with what to do.
@@ -48,7 +48,8 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
     """
     if scene is None:
         raise UsageError("scene", "name one")
-    opened, orbit = scene_of(scene), Orbit() if cameras is None else cameras
+    opened = scene_of(scene)
+    orbit = (opened.cameras or Orbit()) if cameras is None else cameras
     if isinstance(orbit, Orbit) and not len(opened.sample(PROBE_ROWS)):
         orbit = CameraSet((), (), assumed=True)  # the file has no usable Gaussian
     job = Job.of(opened, orbit, options)
