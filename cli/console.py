@@ -156,7 +156,7 @@ class _Rate:
             self._start = now, done
         since, before = self._start
         self.value = (done - before) / (now - since) if now > since else 0.0
-        return f", {self.value:.3g} a second" if self.value else ""
+        return f", {self.value:,{'.3g' if self.value < 100 else '.0f'}} a second" if self.value else ""
 
 
 TERMINAL = Terminal()

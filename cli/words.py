@@ -17,7 +17,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, docs_of, flag
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, AaplugError, UsageError, did_you_mean, within_memory
 
-FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
+# a word that names a file, unlike names and numbers such as 1/4
+FILE = re.compile(r"(?!\.?\d[\d./,]*$)(.*/.*|.*\.[A-Za-z]\w*)", re.DOTALL)
 OPTION = re.compile(r"-(?![\d.])")  # the beginning of a word that is no negative number
 MAX_METAVAR = 30  # characters; longer lists of names stand in an option's help
 SILENT_DEFAULTS = (None, False, True, (), math.inf)  # that help does not show

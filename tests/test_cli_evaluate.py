@@ -39,7 +39,7 @@ def test_the_library_gives_what_the_command_line_gives(cli):
     assert {key: found["_aaplug"][key] for key in own.protocol} == own.protocol
 
 
-@pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"])
+@pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,1/2", "--scale 1 1/2 --recipe=mip,auto,"])
 def test_commas_part_values_as_spaces_do(cli, several):
     out, _ = cli.done(f"evaluate scene.ply --cameras . {several} -o a,b --json")
     methods = {name for name in json.loads(out) if "@" in name and " " not in name}

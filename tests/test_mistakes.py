@@ -3,12 +3,14 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from aaplug_cli.console import TERMINAL
 from aaplug_cli.main import main
 
 from aaplug.io.cameras import read_cameras
@@ -131,3 +133,10 @@ def test_a_principal_point_far_away_is_refused(tmp_path):
     (folder / "images.txt").write_text("1 1 0 0 0 0 0 4 1 a.png\n\n")
     with pytest.raises(FormatError, match=r"camera a\.png: cx: expected a number from -1e"):
         read_cameras(tmp_path)
+
+
+def test_a_rate_of_progress_is_in_plain_digits(capsys):
+    with TERMINAL.progress("merging", "Gaussians") as tell:
+        tell(0, 64_000)
+        tell(64_000, 64_000)
+    assert re.search(r"64,000 of 64,000 Gaussians, [\d,]+ a second", capsys.readouterr().err)
