@@ -42,6 +42,8 @@ def test_photographs_tell_a_scene_from_one_turned_over(sample_scene, sample_came
     assert right.gain > 10
     assert wrong.gain < 0
     assert "farther from the photographs than one flat colour" in wrong.doubt
+    assert str(right).endswith(f"{right.gain:.1f} dB closer to photographs than a flat colour")
+    assert str(wrong).endswith(f"{-wrong.gain:.1f} dB farther from photographs than a flat colour")
 
 
 def test_without_photographs_cameras_should_look_at_the_scenes_middle():

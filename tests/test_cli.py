@@ -63,6 +63,13 @@ def test_render_takes_an_inria_model_folder_as_it_is(cli):
     cli.refused(f"render {model} -o again --iteration 8 --views a --overwrite", "has no iteration 8; it has 7, 30")
 
 
+def test_a_scene_in_a_model_folder_has_its_cameras_wherever_it_is_named_from(cli, monkeypatch):
+    monkeypatch.chdir(inria_model(Path("model"), "Namespace(eval=False)") / "point_cloud")
+    cli.done("render iteration_7/point_cloud.ply -o out --views a")
+    monkeypatch.chdir("iteration_7")
+    cli.done("render point_cloud.ply -o out --views a")
+
+
 def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     cli("render scene.ply --cameras . -o all.png")
     cli("render scene.ply --cameras . -o culled.png --cull-margin 0")

@@ -50,7 +50,7 @@ def test_commas_part_values_as_spaces_do(cli, several):
 def test_without_photographs_it_takes_the_scenes_own_look(cli):
     words = "evaluate scene.ply --cameras . --views train --scale 0.5 --recipe mip --json"
     out, err = cli.done(words)
-    assert "truth: self" in err
+    assert "truth: self (0 of 3 views with a photograph)" in err
     assert json.loads(out)["_aaplug"]["truth"] == "self"
 
 

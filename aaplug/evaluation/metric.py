@@ -114,7 +114,7 @@ class Metric:
     ideal: value of a perfect image; infinite where higher is always better.
     digits: decimals in tables.
     protocol: the field's variant that it is, in words.
-    measure: the value for an image and the truth, both of 8 bits; None where it is undefined.
+    measure: the value for an image of 8 bits and the truth; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
     undefined: the reason why a value can be None; reports print it as a note.
     prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.

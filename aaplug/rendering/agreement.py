@@ -58,7 +58,10 @@ class Agreement:
 
     def __str__(self) -> str:
         size = "" if self.size is None else f", their median size is {self.size:.2g} px"
-        gain = "" if self.gain is None else f", renders are {self.gain:.1f} dB closer to photographs than a flat colour"
+        gain = ""
+        if self.gain is not None:
+            closer = "closer to" if self.gain > 0 else "farther from"
+            gain = f", renders are {abs(self.gain):.1f} dB {closer} photographs than a flat colour"
         return f"the cameras see {self.seen:.0%} of the Gaussians{size}{gain}"
 
 

@@ -21,7 +21,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.options.verbs import EvaluateOptions, Layout
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import OutputError, UsageError, not_one_of
+from aaplug.system.errors import OutputError, UsageError, counted, not_one_of
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
@@ -50,7 +50,8 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     truth = protocol.truth or "auto" if options.truth == "auto" else options.truth
     source = source_of(views, truth)
     if truth == "auto":
-        job.monitor.say(f"truth: {source}{' (not every view has a photograph)' * (source == 'self')}")
+        photos = f"{sum(view.photo is not None for view in views):,} of {counted(len(views), 'view')} with a photograph"
+        job.monitor.say(f"truth: {source}{f' ({photos})' * (source == 'self')}")
     if options.poses and source != "photographs":
         raise UsageError("poses", "are refined on photographs, and the truth is the scene itself: leave out `poses`")
     everything, show = options.layout == "inria", options.show if options.report else "0"

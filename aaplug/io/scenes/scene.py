@@ -5,6 +5,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 """
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -151,7 +152,7 @@ class Scene:
         path = self.folder or self.source
         if path is None:
             return None
-        folder = path.parents[2] if path.match(MODEL_SCENE) else path
+        folder = Path(os.path.normpath(path.parent / "../..")) if path.absolute().match(MODEL_SCENE) else path
         return folder if folder.is_dir() and holds_cameras(folder) else None
 
     @property
