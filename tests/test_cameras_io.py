@@ -406,7 +406,7 @@ def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
 
 def test_folder_of_photos_must_exist_and_hold_some(tmp_path):
     colmap_bin(tmp_path)
-    with pytest.raises(UsageError, match="there is no folder .* starts at the cameras' folder"):
+    with pytest.raises(UsageError, match=r"there is no folder .*: relative paths start at the cameras' folder"):
         read_cameras(tmp_path, images="images_4")
     (tmp_path / "images_4").mkdir()
     with pytest.raises(UsageError, match="holds no photo of these cameras"):

@@ -61,7 +61,7 @@ def photo_folder(root: Path, options: CameraFileOptions, custom: str, place: Pla
         return PhotoFolder(root / custom, root)
     folder = root / options.images
     if not os.path.isdir(folder):
-        raise UsageError("images", f"there is no folder {folder}: a path that is not absolute starts at the cameras' folder")
+        raise UsageError("images", f"there is no folder {folder}: relative paths start at the cameras' folder")
     return PhotoFolder(folder, folder, chosen=True)
 
 
