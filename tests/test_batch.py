@@ -269,15 +269,18 @@ def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_o
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize("part", ["protocol", "truth", "downscale", "metrics"])
-def test_figures_of_several_protocols_are_not_averaged(tmp_path, part):
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [("protocol", "protocols"), ("truth", "truths"), ("downscale", "ways of downscaling"), ("metrics", "flavours")],
+)
+def test_figures_of_several_protocols_are_not_averaged(tmp_path, part, words):
     def by(choice: str):
         measured = Measurement("auto", 1.0, "view", {"SSIM": 0.9, "PSNR": 30.0}, 1, 0.1)
         return lambda **settings: Report((measured,), {part: {"SSIM": choice}})
 
     found = evaluate_all([("x", by("wang")), ("y", by("3dgs"))], tmp_path / "out")
     assert found.summary()["mean"] == {"auto@1": {"SSIM": None, "PSNR": 30.0 if part == "metrics" else None}}
-    assert "no SSIM at 1: the scenes' protocols differ" in found.tables()
+    assert f"no SSIM at 1: the scenes' {words} differ" in found.tables()
 
 
 MANY = """

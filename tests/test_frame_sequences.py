@@ -38,7 +38,7 @@ def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):
     whole, times = bytes_of("out"), {p.name: p.stat().st_mtime_ns for p in Path("out").iterdir()}
     for number in (2, 5):
         Path(f"out/f.{number:04d}.png").unlink()
-    cli.refused(words, "already holds f.0001.png")
+    cli.refused(words, "already holds f.0001.png", "or --resume to go on")
     cli.done(f"{words} --resume")
     assert bytes_of("out") == whole
     again = {path.name for path in Path("out").iterdir() if path.stat().st_mtime_ns != times[path.name]}

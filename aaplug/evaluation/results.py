@@ -21,6 +21,7 @@ from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
+BASIS = "flavours", "protocols", "truths", "ways of downscaling"  # what `Report.basis` holds
 TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
 MILLION = 1e6
 
@@ -205,8 +206,9 @@ def metric_grid(
     why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
     if any(scale not in each.scales for each in reports for scale in empty):
         why = "some scenes have other scales"
-    if any(each.basis(metric.name) != report.basis(metric.name) for each in reports):
-        why = "the scenes' protocols differ"
+    bases = zip(BASIS, *(each.basis(metric.name) for each in reports), strict=True)
+    if differing := [part for part, *values in bases if any(value != values[0] for value in values)]:
+        why = f"the scenes' {' and '.join(differing)} differ"
     return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 
 

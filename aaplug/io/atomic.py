@@ -159,15 +159,19 @@ def output_folder(path: AnyPath) -> Iterator[Path]:
         raise
 
 
-def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
-    """Check, before any work, that none of these files of one folder exists, unless they may be replaced."""
+def refuse_existing(paths: Sequence[Path], overwrite: bool, resume: bool | None = None) -> None:
+    """Check, before any work, that none of these files of one folder exists, unless they may be replaced.
+
+    resume: whether the run that wrote them goes on; None where no run can.
+    """
     folder = paths[0].parent
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file; name a folder")
     refuse_inputs(paths)
     existing = [path.name for path in paths if path.exists()]
-    if existing and not overwrite:
-        raise OutputError(folder, f"already holds {listing(existing, most=3)}; pass `overwrite` to replace files")
+    if existing and not (overwrite or resume):
+        hint = "pass `overwrite` to replace files" + ", or `resume` to go on" * (resume is not None)
+        raise OutputError(folder, f"already holds {listing(existing, most=3)}; {hint}")
 
 
 def refuse_inputs(paths: Iterable[AnyPath], inputs: Iterable[AnyPath] = ()) -> None:

@@ -149,7 +149,7 @@ def batch(
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
 
     def check() -> None:
-        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS, TABLE)], overwrite or resume)
+        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS, TABLE)], overwrite, resume)
         for folder in folders:
             check_results(folder, resume, overwrite)
 

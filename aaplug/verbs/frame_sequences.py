@@ -73,7 +73,7 @@ class FrameSequence:
             frames = counted(self.count, "frame")
             problem = f"holds {listing(further, most=3)}, which would follow the {frames}; remove them"
             raise OutputError(self.folder, problem)
-        refuse_existing(files, overwrite or resume)
+        refuse_existing(files, overwrite, resume)
         if resume and not self.record.exists() and any(path.exists() for path in self.paths):
             raise OutputError(self.record, "does not exist, which says what the frames show; pass `overwrite`")
 

@@ -349,7 +349,7 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
                 raise OutputError(output, f"holds levels for another viewer ({stream.index}); name another folder")
         if options.page is not None:
             programs_of(options.to, Path(options.page))
-    refuse_existing([*files, *others], options.overwrite or options.resume)
+    refuse_existing([*files, *others], options.overwrite, options.resume)
     if not options.overwrite:
         return files, []
     stale = list(takewhile(Path.is_file, (output / f"{stem}_lod{level}.ply" for level in count(len(files)))))
