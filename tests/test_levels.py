@@ -325,5 +325,5 @@ def test_what_cannot_be_merged_is_refused(tmp_path):
     with pytest.raises(FrameError, match="different frames"):
         aaplug.lod(away, aaplug.CameraSet((make_camera(),), (make_camera(),)), simplify=0.5)
     (tmp_path / "scene_lod1.ply").touch()
-    with pytest.raises(OutputError, match="already holds scene_lod1.*or `resume` to go on"):
+    with pytest.raises(OutputError, match=r"already holds scene_lod1.*or `resume` to go on"):
         aaplug.lod(make_scene(9), output=tmp_path, levels=1)
