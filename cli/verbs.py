@@ -286,7 +286,8 @@ def info(words: Words) -> Answer:
     """
     if words.limits:
         return _limits()
-    facts = aaplug.info(*read_inputs(words), **told(words, FrameOptions))
+    inputs = read_inputs(words)
+    facts = aaplug.info(*inputs, **told(words, FrameOptions))
     shown = {key: value for key, value in facts.items() if key not in PROGRAM_KEYS and value != []}
     names = [key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ") for key in shown]
     return Answer(facts, [table(zip(names, map(_text, shown.values()), strict=True))])
