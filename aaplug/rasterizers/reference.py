@@ -6,7 +6,6 @@ slopes; strips and chunks bound its memory.  Differentiable through autograd.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -46,8 +45,12 @@ class Reference:
         splats = splats[torch.sort(splats.depths, stable=True).indices]
         y, x = (torch.arange(side, dtype=torch.float64, device=splats.means.device) + 0.5 for side in hw)
         centres = torch.cartesian_prod(y, x).flip(1)
-        draw = partial(composited, pixel=pixel) if compositor is None else compositor.exact
-        painted = [(at, *draw(drawn, centres[at], rules=rules)) for at, drawn in _strips(splats, centres)]
+        painted = [
+            (at, *composited(drawn, centres[at], pixel, rules))
+            if compositor is None
+            else (at, *compositor.exact(drawn, centres[at], rules))
+            for at, drawn in _strips(splats, centres)
+        ]
         places, rgb, transmittance = (torch.cat(parts) for parts in zip(*painted, strict=True))
         back = places.argsort()
         rgb, transmittance = rgb[back], transmittance[back]
