@@ -157,9 +157,9 @@ def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tup
     lists = {key: document[key] for key in FILE_LISTS if key in document}
     if FILE_LISTS[0] not in lists:
         return None
+    place = object_of(document, file, "lists of file names", "frames").place
     for key, listed in lists.items():
         right = isinstance(listed, list) and all(isinstance(path, str) for path in listed)
-        place = object_of(document, file, "lists of file names", "frames").place
         place.expect(right, key, "a list of paths", listed)
     train = set(lists[FILE_LISTS[0]])
     return tuple(path not in train for path in paths)

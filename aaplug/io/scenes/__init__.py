@@ -24,7 +24,7 @@ from aaplug.io.atomic import AnyPath, check_output
 from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.faults import described_faults, faults_of
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.rows import SceneFileOptions, library_errors
+from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
@@ -34,7 +34,6 @@ from aaplug.system.registry import Registry, named
 
 log = logging.getLogger("aaplug")
 
-HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
 NUMBERED = re.compile(r"(.*?)(?<!\d)(?<!_lod)(\d+)((?:\.compressed)?\.ply)", re.ASCII)  # levels of detail are no frames
 
 
@@ -262,17 +261,19 @@ def find_scene(path: AnyPath, iteration: int | None = None) -> Path:
         return path_of(path, read_manifest(path).levels[0])
     pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob(MODEL_SCENE)
     scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
-    if not scenes and (indexes := [path / index for index in FOLDER_INDEXES if (path / index).is_file()]):
-        return indexes[0]
-    if not scenes and (frames := frame_files(path)):
-        return path / next(iter(frames)).name
-    if not scenes and (index := next((name for name in STREAM_INDEXES.values() if (path / name).is_file()), None)):
-        raise FormatError(path, f"holds levels for another viewer ({index}); name the scene that they were made of")
     if not scenes:
-        known = (
-            f"point_cloud/iteration_<N>/point_cloud.ply, {MANIFEST}, {', '.join(FOLDER_INDEXES)} or numbered .ply files"
-        )
-        raise FormatError(path, f"holds no {known}; name the scene's file")
+        for index in FOLDER_INDEXES:
+            if (path / index).is_file():
+                return path / index
+        if frames := frame_files(path):
+            return path / next(iter(frames)).name
+        for index in STREAM_INDEXES.values():
+            if (path / index).is_file():
+                raise FormatError(
+                    path, f"holds levels for another viewer ({index}); name the scene that they were made of"
+                )
+        known = f"{MANIFEST}, {', '.join(FOLDER_INDEXES)} or numbered .ply files"
+        raise FormatError(path, f"holds no point_cloud/iteration_<N>/point_cloud.ply, {known}; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")

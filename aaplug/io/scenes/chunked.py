@@ -15,16 +15,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.io import STREAM_INDEXES
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
 from aaplug.io.scenes.packed import Piece, rows_of
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
 from aaplug.system.errors import FormatError, counted
 
-HEAD_BYTES = 64  # of a chunk, which tell its format
 TRAILING_COMMA = re.compile(rb",(\s*[}\]])")  # some writers of .lcc2 leave one at the end of a list
 
 
@@ -140,4 +140,7 @@ def _lcc2(root: Entry, chunks: Chunks) -> list[Piece]:
     return [*pieces, chunks.rows(names, far.entry("env"), "name", "start")] if "env" in far else pieces
 
 
-FORMATS = (ChunkedFormat("lod-meta.json", _streamed_sog), ChunkedFormat("lcc2", _lcc2, turned_from_z_up, (CREDIT,)))
+FORMATS = (
+    ChunkedFormat(STREAM_INDEXES["sog"], _streamed_sog),
+    ChunkedFormat("lcc2", _lcc2, turned_from_z_up, (CREDIT,)),
+)

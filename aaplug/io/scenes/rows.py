@@ -12,6 +12,7 @@ from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.errors import AaplugError, FormatError, reason
 
+HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
 MAX_REASON = 200  # characters of a library's message
 
 

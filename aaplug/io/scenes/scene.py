@@ -23,6 +23,7 @@ from aaplug.core.gaussians import Fusion, Gaussians, Origin, digest_of_scene, jo
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
+from aaplug.io import STREAM_INDEXES
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
@@ -32,7 +33,7 @@ from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
-FOLDER_INDEXES = ("meta.json", "lod-meta.json")  # each marks a folder that is a scene: of SOG images, of chunks
+FOLDER_INDEXES = ("meta.json", STREAM_INDEXES["sog"])  # each marks a folder that is a scene: of SOG images, of chunks
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
