@@ -14,7 +14,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -66,8 +66,7 @@ class Registry(Mapping[str, T]):
     @property
     def names(self) -> list[str]:
         """All names, also of plug-ins that cannot be used; nothing is imported."""
-        points = _points().select(group=group_of(self.kind))
-        return list(dict.fromkeys([*self._built_in, *(point.name for point in points), *self._entries]))
+        return list(dict.fromkeys([*self._built_in, *(p.name for p in _points_of(self.kind)), *self._entries]))
 
     @property
     def type(self) -> Any:
@@ -131,10 +130,9 @@ class Registry(Mapping[str, T]):
         for group in sorted(_points().groups):
             if group.startswith(PREFIX) and group not in groups:
                 log.warning("entry point group %s is not known%s", group, did_you_mean(group, groups))
-        group = group_of(self.kind)
-        for point in _points().select(group=group):
+        for point in _points_of(self.kind):
             package = f" of package {point.dist.name}" if point.dist else ""
-            where = f"plug-in {point.value}{package} ({group})"
+            where = f"plug-in {point.value}{package} ({point.group})"
             try:
                 if point.dist and point.dist.name == "aaplug" and find_spec(point.module.rpartition(".")[0]) is None:
                     continue  # the folder for comparisons may be deleted
@@ -173,7 +171,7 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
     names = registry_of(kind).names
     if comparisons:
         return names
-    ours = {p.name for p in _points().select(group=group_of(kind)) if p.module.startswith("aaplug.")}
+    ours = {p.name for p in _points_of(kind) if p.module.startswith("aaplug.")}
     return [name for name in names if name not in ours]
 
 
@@ -191,6 +189,12 @@ def _at(place: str) -> Any:
     """The object at "module:name"."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
+
+
+@cache
+def _points_of(kind: str) -> tuple[EntryPoint, ...]:
+    """Entry points of a kind."""
+    return tuple(_points().select(group=group_of(kind)))
 
 
 @cache
