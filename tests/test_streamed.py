@@ -299,8 +299,9 @@ def test_parts_are_for_their_viewer_also_without_tuning(tmp_path, to, viewer):
     for folder in streamed.part_folders(tmp_path / "out", to):
         assert read_scene(folder / streamed.STREAMS[to].content).convention == VIEWERS[viewer].convention
     if to != "sog":
-        with pytest.raises(FormatError, match=f"holds levels for another viewer .{streamed.STREAMS[to].index}.; name"):
-            read_scene(tmp_path / "out")
+        for path in (tmp_path / "out", tmp_path / "out" / streamed.STREAMS[to].index):
+            with pytest.raises(FormatError, match=f"{streamed.STREAMS[to].index}: holds levels for another viewer"):
+                read_scene(path)
 
 
 def test_a_page_has_the_viewer_beside_it(tmp_path):

@@ -34,6 +34,7 @@ from aaplug.system.registry import Registry, named
 
 log = logging.getLogger("aaplug")
 
+RAD_SUFFIX = ".rad"  # of levels for Spark
 NUMBERED = re.compile(r"(.*?)(?<!\d)(?<!_lod)(\d+)((?:\.compressed)?\.ply)", re.ASCII)  # levels of detail are no frames
 
 
@@ -151,6 +152,8 @@ def read_scene(
         raise FormatError(path, "is empty")
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     format = next((format for format in formats if format.sniff(path, head)), None)
+    if format is None and (path.name in STREAM_INDEXES.values() or path.suffix.lower() == RAD_SUFFIX):
+        raise FormatError(path, "holds levels for another viewer; name the scene that they were made of")
     if format is None:
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
@@ -251,7 +254,7 @@ def find_scene(path: AnyPath, iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
     A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images or chunks,
-    the finest of its levels of detail, or the first of its frames.
+    the finest of its levels of detail, the first of its frames, or an index of levels for another viewer.
     Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
@@ -269,9 +272,7 @@ def find_scene(path: AnyPath, iteration: int | None = None) -> Path:
             return path / next(iter(frames)).name
         for index in STREAM_INDEXES.values():
             if (path / index).is_file():
-                raise FormatError(
-                    path, f"holds levels for another viewer ({index}); name the scene that they were made of"
-                )
+                return path / index
         known = f"{MANIFEST}, {', '.join(FOLDER_INDEXES)} or numbered .ply files"
         raise FormatError(path, f"holds no point_cloud/iteration_<N>/point_cloud.ply, {known}; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
