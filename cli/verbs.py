@@ -470,7 +470,7 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
     "exp/eval": lambda run: f"{run.exponentials:.2f}",
     "calls": lambda run: f"{sum(run.calls.values()):,}",
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
-    "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
+    "GB": lambda run: "" if run.peak_bytes is None else f"{run.peak_bytes / 1e9:.1f}",
 }
 
 

@@ -5,10 +5,10 @@ exponentials: compositing computes one in each evaluation, also with whole vecto
 """
 
 import math
-import resource
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import linear_regression, median
@@ -48,7 +48,7 @@ class Figures:
 
     gaussians: those of the scene, or of the levels of detail that the view draws.
     evaluations: splat-pixel evaluations of compositing.
-    peak_bytes: the most memory that the process has used so far.
+    peak_bytes: the most memory that the process has used so far; None on Windows.
     calls: of torch's operators and of compiled kernels in a frame, each of which costs microseconds beside its work.
     exponential_ns: of one float32 exponential by torch, with the same threads.
     """
@@ -62,7 +62,7 @@ class Figures:
     evaluations: int
     ns_per_evaluation: float
     stages_ms: dict[str, float]
-    peak_bytes: int
+    peak_bytes: int | None
     calls: dict[str, int]
     exponential_ns: float
 
@@ -108,6 +108,11 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         frame, yardstick = _timed(repeats, lambda: renderer(camera), exponentials)
     evaluations = sum(count for count, _ in runs)
     [gradients] = _timed(repeats, lambda: gradient_step(renderer, camera))
+    peak = None
+    with suppress(ImportError):  # Windows has no such module
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return Figures(
         rasterizer=kernels.name,
         gaussians=gaussians,
@@ -118,7 +123,7 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         evaluations=evaluations,
         ns_per_evaluation=stages["composite"] * 1e6 / max(1, evaluations),
         stages_ms=stages,
-        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
+        peak_bytes=peak,
         calls={"operators": operators.count, "compiled kernels": sum(compiled for _, compiled in runs)},
         exponential_ns=yardstick * 1e6 / (EXPONENTIALS * EXPONENTIAL_CALLS),
     )
