@@ -115,6 +115,8 @@ def test_another_aspect_keeps_pixels_square_and_the_scene_in_view():
     framed = view.framed(300, 900)
     assert (framed.fx, framed.fy) == pytest.approx((300 / 1066 * view.fx,) * 2)
     assert (framed.cx, framed.cy, framed.trained_focal) == (150, 450, view.trained_focal)
+    shifted = replace(view, cx=view.cx + 106.6, cy=view.cy - 53.3).framed(300, 900)
+    assert (shifted.cx, shifted.cy) == pytest.approx((180, 435))
 
 
 def test_the_assumed_rate_is_as_stated():

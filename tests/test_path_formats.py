@@ -168,6 +168,22 @@ def test_keys_of_gltf_step_or_lie_on_a_cubic(tmp_path, way):
     assert [round(camera.centre[0].item(), 4) for camera in cameras] == [round(x / 10, 4) for x in range(21)]
 
 
+def test_sparse_keys_of_gltf_are_no_frames_and_scales_move_what_is_below(tmp_path):
+    document = gltf(binary(), "path.bin")
+    document["accessors"][0]["count"] = document["accessors"][1]["count"] = 3
+    [animation] = document["animations"]
+    animation["channels"][0]["target"]["path"] = "scale"
+    times, sizes = np.arange(3, dtype="<f4"), np.repeat(np.arange(1, 4, dtype="<f4"), 3)
+    turns = np.array([0, 0, 0, 127, 0, 90, 0, 90], "<i1")  # gltfpack writes integers
+    document["accessors"][3] |= {"componentType": 5120, "normalized": True}
+    data = b"".join(part.tobytes().ljust(size) for part, size in ((times, 84), (sizes, 252)))
+    (tmp_path / "path.bin").write_bytes(data + binary()[336:344] + turns.tobytes().ljust(32))
+    path = read_camera_path(written(tmp_path, "path.gltf", document))
+    assert (path.fps, len(path.cameras)) == (30, 61)
+    assert path.cameras[30].centre.tolist() == pytest.approx([0, 0, 10])
+    assert forward(path.cameras[-1]) == pytest.approx([-1, 0, 0], abs=1e-6)
+
+
 @pytest.mark.parametrize("uri", ["../path.bin", "/etc/hostname", "http://x/path.bin", "a\0b", "none.bin"])
 def test_no_buffer_is_read_beyond_the_folder(tmp_path, uri):
     (tmp_path / "in").mkdir()
@@ -201,6 +217,13 @@ def Xform "rig"
 }
 """
 
+STILL = """{ 1: (0, 0, 7) }
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    def Camera "cam"
+    {
+        float focalLength.timeSamples = { 1: 18 }
+        """
+
 
 def test_a_camera_of_usd_brings_lens_aperture_and_shutter(tmp_path):
     pytest.importorskip("pxr")
@@ -213,6 +236,28 @@ def test_a_camera_of_usd_brings_lens_aperture_and_shutter(tmp_path):
     assert forward(middle) == pytest.approx([0, 0, -1])
     assert first.exposure.aperture.radius == pytest.approx(1.8 / 2 / 2)
     assert first.exposure.aperture.focus == 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "frames", "z"),
+    [
+        ("timeCodesPerSecond = 24", "timeCodesPerSecond = 12\n framesPerSecond = 24", 5, 5),
+        ("{ 1: (0, 0, 5), 3: (2, 0, 5) }", "{ 1: (0, 0, 7) }", 3, 7),
+        (USDA[USDA.index("{ 1: (0") : USDA.index("double shutter:open")], STILL, 1, 7),
+    ],
+    ids=["ticks", "one key beside others", "one key"],
+)
+def test_frames_of_usd_are_those_of_its_stage_and_one_key_holds(tmp_path, old, new, frames, z):
+    pytest.importorskip("pxr")
+    assert USDA.count(old) == 1
+    other = (
+        frames > 1
+    ) * 'def Camera "other"\n{\n token visibility.timeSamples = { 1: "inherited", 3: "invisible" }\n}\n'
+    path = read_camera_path(
+        written(tmp_path, "path.usda", USDA.replace(old, new).replace("def Xform", other + "def Xform"))
+    )
+    assert (path.fps, len(path.cameras), path.cameras[-1].centre[2].item(), path.unsized) == (24, frames, z, True)
+    assert path.shutter == (0.5 if frames < 5 else 1)
 
 
 @pytest.mark.parametrize("layer", ["../out.usda", "/etc/out.usda", "http://x/a.usda"])

@@ -172,7 +172,8 @@ class Camera:
     def framed(self, width: Side, height: Side) -> "Camera":
         """The same pose in `width` × `height` px, square as before: the shorter side keeps its field of view."""
         factor = min(width, height) / min(self.hw)
-        middle = {"cx": width / 2, "cy": height / 2, "exposure": self._exposed_as(lambda c: c.framed(width, height))}
+        cx, cy = width / 2 + factor * (self.cx - self.width / 2), height / 2 + factor * (self.cy - self.height / 2)
+        middle = {"cx": cx, "cy": cy, "exposure": self._exposed_as(lambda c: c.framed(width, height))}
         return replace(self, width=width, height=height, fx=self.fx * factor, fy=self.fy * factor, **middle)
 
     def as_trained(self) -> "Camera":

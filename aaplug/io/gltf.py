@@ -135,8 +135,8 @@ class Gltf:
         return Accessor(entry.place, buffer, start, stride, dtype, width, count, most)
 
     def numbers(self, owner: Entry, field: str, kind: str) -> Float[Tensor, "n c"]:
-        """The finite floats of the accessor that a field names, all in float64."""
-        found = self.accessor(owner, field, kind)
+        """The finite numbers of the accessor that a field names, all in float64; rotations may be integers."""
+        found = self.accessor(owner, field, kind, tuple(TYPES) if kind == "VEC4" else (FLOAT,))
         most = whole_limit("JSON") // 4
         found.place.expect(found.count * found.width <= most, "count", f"at most {most:,} numbers", found.count)
         values = found.read(0, found.count)

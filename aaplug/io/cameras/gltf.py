@@ -1,9 +1,9 @@
 """Cameras of glTF 2.0, .gltf and .glb: the first that an animation moves, or else the first.
 
 A perspective camera looks along -z with y up (OpenGL), at the place of its node, in the file's world; yfov is the
-vertical angle in rad.  Of an animation, translations and rotations of the camera's node and those above it are read.
-Scales do not matter to a camera.  The frame rate is that of the densest even keys, else 30 a second.  Focal lengths
-that KHR_animation_pointer moves stay.
+vertical angle in rad, which an image of another shape keeps.  Of an animation, the motions of the camera's node and
+those above it are read.  The frame rate is that of the densest even keys, else 30 a second.  Focal lengths that
+KHR_animation_pointer moves stay.
 """
 
 from pathlib import Path
@@ -23,8 +23,8 @@ from aaplug.io.gltf import Gltf, at_rest
 from aaplug.io.values import Entry, Place, entries, natural, number, text
 from aaplug.system.errors import FormatError
 
-PATHS = {"translation": "VEC3", "rotation": "VEC4"}  # that move a camera
-MAX_RATE = 240.0  # frames per second
+PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}  # that move a camera
+MIN_RATE, MAX_RATE = 10.0, 240.0  # frames per second; sparser keys are no frames
 EVEN = 1e-3  # of the spacing between keys, which counts as rounding
 
 name = "gltf"
@@ -57,9 +57,9 @@ def path_of(path: Path) -> CameraPath:
     rows = zip(axes * OPENCV_FROM_OPENGL, motions[:, :3, 3], strict=True)
     poses = torch.stack([pose(turn, where, place, "its transform") for turn, where in rows])
     tangent, aspect = _lens(file, nodes[chosen])
-    size = UNSIZED if aspect is None else (max(1, round(UNSIZED[1] * aspect)), UNSIZED[1])
+    size = max(1, round(UNSIZED[1] * aspect)), UNSIZED[1]
     cameras = cameras_of(poses, torch.full((len(at),), tangent), lambda size: size[1], place, size)
-    return CameraPath(cameras, fps, unsized=aspect is None)
+    return CameraPath(cameras, fps, unsized=True)
 
 
 Channel = tuple[Tensor, Tensor, str]  # times in s, values, interpolation
@@ -92,14 +92,18 @@ def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
 
 def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -> Float[Tensor, "f 4 4"]:
     """A node's own motion at these times."""
-    own = node if not channels else Entry(node.place, {k: v for k, v in node.fields.items() if k != "matrix"})
+    hidden = ("matrix", "scale") if channels else ()
+    own = Entry(node.place, {key: value for key, value in node.fields.items() if key not in hidden})
     motions = at_rest(own).repeat(len(at), 1, 1)
     if "translation" in channels:
         motions[:, :3, 3] = _sampled(channels["translation"], at, node.place, False)
     if "rotation" in channels:
         quats = keyframes.unit(_sampled(channels["rotation"], at, node.place, True), node.place)
-        sizes = node.vector("scale", 3) if "scale" in node else 1.0
-        motions[:, :3, :3] = rotation_matrices(quats.roll(1, dims=1)) * sizes
+        motions[:, :3, :3] = rotation_matrices(quats.roll(1, dims=1))
+    if "scale" in channels:
+        motions[:, :3, :3] *= _sampled(channels["scale"], at, node.place, False)[:, None]
+    elif channels and "scale" in node:
+        motions[:, :3, :3] *= node.vector("scale", 3)
     return motions
 
 
@@ -121,21 +125,22 @@ def _sampled(channel: Channel, at: Float[Tensor, " f"], place: Place, turns: boo
 
 
 def _rate(times: Float[Tensor, " n"]) -> float:
-    """Keys per second, where there are several and even ones; else 0."""
+    """Keys per second, where there are several and even ones, as dense as frames; else 0."""
     steps = times.diff()
     if len(steps) < 2 or float((steps - steps.mean()).abs().max()) > EVEN * float(steps.mean()):
         return 0.0
-    return min(MAX_RATE, round(1 / float(steps.mean()), 3))
+    rate = round(1 / float(steps.mean()), 3)
+    return min(MAX_RATE, rate) if rate >= MIN_RATE else 0.0
 
 
-def _lens(file: Gltf, node: Entry) -> tuple[float, float | None]:
-    """Tangent of half the vertical angle, and width over height if the file says."""
+def _lens(file: Gltf, node: Entry) -> tuple[float, float]:
+    """Tangent of half the vertical angle, and width over height."""
     camera = file.item("cameras", node, "camera")
     kind: Any = camera.fields.get("type")
     camera.place.expect(kind == "perspective", "type", "perspective", kind)
     lens = camera.entry("perspective")
     angle = lens.get("yfov", number)
     lens.place.expect(0 < angle < np.pi, "yfov", "above 0 and below π, in radians", angle)
-    aspect = lens.get("aspectRatio", number) if "aspectRatio" in lens else None
-    lens.place.expect(aspect is None or 1 / 64 <= aspect <= 64, "aspectRatio", "from 1/64 to 64", aspect)
+    aspect = lens.get("aspectRatio", number, UNSIZED[0] / UNSIZED[1])
+    lens.place.expect(1 / 64 <= aspect <= 64, "aspectRatio", "from 1/64 to 64", aspect)
     return float(np.tan(angle / 2)), aspect

@@ -1,8 +1,9 @@
 """Cameras of USD, .usda, .usdc, .usd and .usdz: the first that time samples move, or else the first.
 
 A camera looks along -z with y up, in the stage's world.  Its focal length, apertures (the size of the film) and their
-offsets are in tenths of a world unit; f-stop, focus distance and shutter are UsdGeom.Camera's.  The frames are the time
-codes of the stage.  Layers that the file names must lie in its folder: others are refused before the stage is composed.
+offsets are in tenths of a world unit; f-stop, focus distance and shutter are UsdGeom.Camera's.  The frames are those of
+the stage's framesPerSecond, else its time codes.  Layers that the file names must lie in its folder: others are refused
+before the stage is composed.
 """
 
 import math
@@ -14,7 +15,7 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import Aperture, Camera, Exposure
+from aaplug.core.cameras import WHOLE_SLACK, Aperture, Camera, Exposure
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
@@ -54,19 +55,23 @@ def _read(path: Path) -> CameraPath:
         raise FormatError(path, "holds no camera")
     camera = next(filter(_moves, found), found[0])
     place = Place(path, f"camera {camera.GetPath()}")
-    times, moving = [0.0], _moves(camera)
+    times, moving = [Usd.TimeCode.EarliestTime()], _moves(camera)
+    codes = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
+    authored = stage.HasAuthoredMetadata("framesPerSecond")
+    fps = number(stage.GetFramesPerSecond(), place, "framesPerSecond") if authored else codes
+    place.expect(codes > 0 and fps > 0, "frames and time codes per second", "above 0", [fps, codes])
     if stage.HasAuthoredTimeCodeRange() and moving:
         first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
-        place.expect(0 <= last - first < MAX_FRAMES, "time codes", f"a range of at most {MAX_FRAMES:,}", [first, last])
-        times = [first + step for step in range(math.floor(last - first) + 1)]
+        steps = (last - first) * fps / codes
+        place.expect(0 <= steps < MAX_FRAMES, "time codes", f"a range of at most {MAX_FRAMES:,} frames", [first, last])
+        times = [Usd.TimeCode(first + step * codes / fps) for step in range(math.floor(steps + WHOLE_SLACK) + 1)]
     elif moving:
         raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
     digits = len(str(len(times) - 1))
-    cameras = [_camera(camera, Usd.TimeCode(t) if moving else Usd.TimeCode.Default(), place) for t in times]
+    cameras = [_camera(camera, time, place) for time in times]
     named = tuple(replace(view, name=f"{i:0{digits}}") for i, (view, _) in enumerate(cameras))
-    fps = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
-    place.expect(fps > 0, "timeCodesPerSecond", "above 0", fps)
-    return CameraPath(named, fps, cameras[0][1])
+    shutter = cameras[0][1] * fps / codes
+    return CameraPath(named, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
 
 
 def module(name: str) -> Any:
@@ -96,14 +101,15 @@ def _check_layers(path: Path) -> None:
 def _moves(camera: Any) -> bool:
     """Whether the camera, or a prim above it, has time samples."""
     UsdGeom, prim = module("UsdGeom"), camera.GetPrim()
-    own = any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAttributes())
+    names = UsdGeom.Camera.GetSchemaAttributeNames(False)
+    own = any(prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
     while prim and not own:
         own = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if prim.IsA(UsdGeom.Xformable) else False
         prim = prim.GetParent()
     return own
 
 
-def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float | None]:
+def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float]:
     """The camera at a time, and its shutter in time codes."""
 
     def value(name: str) -> float:
@@ -131,4 +137,4 @@ def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float | None]
         view = Camera("0", width, height, f, f, cx, cy, pose, exposure=aperture)
     except UsageError as error:
         raise place.error(str(error)) from error
-    return view, shutter if 0 < shutter <= 1 else None
+    return view, shutter
