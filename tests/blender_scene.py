@@ -63,13 +63,26 @@ if len(sys.argv) > 3:
     background = camera.data.background_images[0]
     result["background"] = [*background.image.size, background.image.source, background.image_user.frame_duration]
     scene.aaplug.goal = "NODE"
+    scene.aaplug.options += ' --background "#ff8000" --format webp'
     result["draw again"] = list(bpy.ops.aaplug.draw())
     tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
-    result["node"] = tree.nodes["aaplug"].image.name
-    scene.aaplug.splats = "nothing.ply"
-    try:
-        result["fails"] = list(bpy.ops.aaplug.draw())
-    except RuntimeError as error:
-        result["fails"] = str(error)
+    image = tree.nodes["aaplug"].image
+    result["node"] = [image.name, Path(image.filepath).name, *(round(x * 255) for x in image.pixels[:3])]
+
+    def refused(**settings):
+        for name, value in settings.items():
+            setattr(scene.aaplug, name, value)
+        try:
+            return list(bpy.ops.aaplug.draw())
+        except RuntimeError as error:
+            return str(error)
+
+    result["no scene"] = refused(splats="nothing.ply")
+    result["silent"] = refused(program="false")
+    result["not saved"] = refused(folder="//aaplug")
+    result["no splats"] = refused(splats="")
+    origin.scale, scene.aaplug.frame = (1, 2, 2), origin
+    bpy.context.view_layer.update()
+    result["stretched"] = refused(splats="a.ply", folder=str(folder))
 addon.unregister()
 (folder / "result.json").write_text(json.dumps(result))

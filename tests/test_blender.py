@@ -69,8 +69,12 @@ def test_frames_are_drawn_and_loaded(exported):
     _, result = exported
     assert result["draw"] == result["draw again"] == ["FINISHED"]
     assert result["background"] == [640, 267, "SEQUENCE", 5]
-    assert result["node"] == "aaplug"
-    assert "nothing.ply" in str(result["fails"])
+    assert result["node"] == ["aaplug", "0.webp", 255, 128, 0]
+    assert "nothing.ply" in result["no scene"]
+    assert "false ended with status 1" in result["silent"]
+    assert "Folder: save the .blend file first" in result["not saved"]
+    assert "Splats: choose a scene" in result["no splats"]
+    assert "Frame: its scale should be the same along all axes" in result["stretched"]
 
 
 def test_layers_of_an_exr_are_outputs_of_an_image_node_by_name(tmp_path):

@@ -229,6 +229,15 @@ def test_a_path_file_brings_its_aperture_and_shutter(tmp_path):
     assert views[0].exposure.motion is not None
     assert views[0].exposure.samples == 4
     assert filmed(file.cameras, FilmOptions(samples=0), True, file.shutter)[0].exposure is None
+    for still in (views[:1], views[:1] * 2):  # the file's shutter, but no motion
+        assert filmed(still, FilmOptions(samples=4), True, file.shutter)[0].exposure.motion is None
+    bare = replace(views[0], exposure=None)
+    assert filmed([bare], FilmOptions(samples=4), True, file.shutter) == [bare]
+    how = {"path": tmp_path / "path.json", "lens": "equirect", "resolution": "16x8", "min_seen": 0.0}
+    scene, cameras = make_scene(20), CameraSet((VIEW,), (VIEW,))
+    with pytest.raises(UsageError, match="aperture"):
+        aaplug.render(scene, cameras, tmp_path / "out", **how)
+    assert len(aaplug.render(scene, cameras, tmp_path / "out", samples=0, **how)) == 2
 
 
 @pytest.mark.parametrize("wrong", [{"radius": 0, "focus": 3}, {"radius": 1}, {"radius": 1, "focus": 1, "blades": 2}, 3])

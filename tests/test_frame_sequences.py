@@ -82,8 +82,8 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
 
 
 REFUSED = {
-    "v.exr": "a video holds 8-bit colours and is not resumed; name a sequence, such as frames/frame.####.exr",
-    "v.webm --transparent": "a video holds 8-bit colours and is not resumed",
+    "v.%04d.exr": "name a .webm or .mp4 file, or frames such as name.####.png",
+    "v.webm --transparent": "8-bit colours and is not resumed; name a sequence, such as frames/frame.####.exr",
     "v.webm --resume": "a video holds 8-bit colours and is not resumed",
     "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",
     "##/a.png": "name a .webm or .mp4 file",

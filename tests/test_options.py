@@ -94,6 +94,7 @@ REFUSED = {
     "render s.ply -o out --samples 0 --f-stop 2 --focus-distance 1": "--f-stop: is ignored by --samples of 0",
     "video s.ply -o v.mp4 --path orbit --start 0.5": "--start: is for the paths zoom, dolly, not for orbit",
     "video s.ply -o v.mp4 --path a.json --seconds 2": "is for the paths zoom, dolly, orbit, not for a.json",
+    "video s.ply -o v.mp4 --path a.json --views b": "--views: is for the paths zoom, dolly, orbit, not for a.json",
     "lod s.ply -o l.ply --steps 3 --no-refine": "--steps: are of tuning, which --no-refine leaves out",
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
     "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",

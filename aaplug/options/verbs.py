@@ -99,7 +99,8 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, paths in (("start", RECEDING_PATHS), ("end", RECEDING_PATHS), ("seconds", BUILT_IN_PATHS)):
+        for name in ("start", "end", "seconds", "views"):
+            paths = RECEDING_PATHS if name in ("start", "end") else BUILT_IN_PATHS
             if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
                 raise UsageError(name, f"is for the paths {listing(paths)}, not for {self.path}")
 

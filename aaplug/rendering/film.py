@@ -41,14 +41,16 @@ def filmed(
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
-    elif shutter is not None:
+    elif shutter is not None and (len(views) > 1 or options.shutter is not None):
         if not path:
             problem = "is a share of the time between frames of a path; for one view give `camera_to`"
             raise UsageError("shutter", problem)
         motions = _motions([_instant(view) for view in views], shutter)
     if motions and all(_still(*motion) for motion in motions):
-        raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
-    if options.samples is not None and not any(apertures) and not motions:
+        if camera_to or options.shutter is not None:
+            raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
+        motions = ()  # the path's file has a shutter, and a camera that stands still
+    if options.samples is not None and not any(apertures) and not motions and shutter is None:
         moving = "`shutter`" if path else "`camera_to`"
         raise UsageError("samples", f"are of an aperture or a shutter; give `f_stop` or {moving}")
     count = options.samples or (FAST_SAMPLES if options.quality == "fast" else SAMPLES)

@@ -21,7 +21,7 @@ from aaplug.io.cameras import read_camera_path
 from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
-from aaplug.io.video import check_video, write_video
+from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
@@ -65,7 +65,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     target = Path("video.webm" if output is None else output)
     sequence = FrameSequence.of(target, options.format)
     storage, options = storage_of(target if sequence is None else sequence.pattern, options)
-    if sequence is None and (storage != PNG or options.resume):
+    if sequence is None and target.suffix.lower() in CODECS and (storage != PNG or options.resume):
         raise OutputError(target, f"a video holds 8-bit colours and is not resumed; name a sequence, {SEQUENCE}")
     if options.lens == "vr180" and sequence is not None:
         raise UsageError("lens", "vr180 is a pair of images, of which a sequence has one: `render --path` writes both")

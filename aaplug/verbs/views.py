@@ -34,6 +34,7 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
     Raises UsageError if an image would be larger than `MAX_SIDE`.
     """
     options = job.options
+    views = [replace(view, exposure=None) for view in views] if options.samples == 0 else views
     bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
     if options.resolution is None:
         sized = [view.scaled(options.scale or 1.0) for view in bent]

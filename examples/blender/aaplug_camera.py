@@ -6,6 +6,7 @@ It writes nerfstudio's camera_path.json with each frame's exact lens, in px, and
 
 import json
 import math
+import shlex
 import subprocess
 from pathlib import Path
 
@@ -22,13 +23,14 @@ bl_info = {
     "category": "Import-Export",
 }
 MILLIMETRE = 1e-3  # in Blender's units, which Cycles takes for metres
+EVEN = 1e-3  # relative difference between scales that counts as rounding
 NAME = "aaplug"  # of the image, its background and its node
 
 
 def camera_path(scene, frames):
     """The path file's content for these frame numbers; the scene keeps its current frame.
 
-    Raises ValueError for a camera that has no perspective lens.
+    Raises ValueError for a camera that has no perspective lens, and for a Frame that stretches or mirrors.
     """
     render, current = scene.render, scene.frame_current
     scale = render.resolution_percentage / 100
@@ -66,7 +68,10 @@ def _camera(scene, size):
     pose, unit = camera.matrix_world.normalized(), 1.0
     if scene.aaplug.frame is not None:
         splats = scene.aaplug.frame.matrix_world
-        unit = sum(splats.to_scale()) / 3
+        sizes = splats.to_scale()
+        if not 0 < max(sizes) <= (1 + EVEN) * min(sizes):
+            raise ValueError(f"Frame: its scale should be the same along all axes and above 0, not {tuple(sizes)}")
+        unit = sum(sizes) / 3
         pose = splats.normalized().inverted() @ pose
         pose.translation /= unit
     frame = {
@@ -98,24 +103,30 @@ def write_path(scene, file, frames):
 def draw(scene, frames, folder):
     """Have aaplug draw these frames into a folder; returns the images in order.
 
-    Raises ValueError with what aaplug says where it fails.
+    Raises ValueError with what is missing, or what aaplug says where it fails.
     """
-    settings, folder = scene.aaplug, Path(folder)
+    settings = scene.aaplug
+    if not settings.splats:
+        raise ValueError("Splats: choose a scene to draw")
+    if folder.startswith("//") and not bpy.data.filepath:
+        raise ValueError("Folder: save the .blend file first, beside which it lies, or choose another")
+    folder = Path(bpy.path.abspath(folder))
     folder.mkdir(parents=True, exist_ok=True)
     write_path(scene, folder / "camera_path.json", frames)
     images = folder / "frames"
-    words = [settings.program, "render", bpy.path.abspath(settings.splats)]
+    words = [bpy.path.abspath(settings.program), "render", bpy.path.abspath(settings.splats), "--json"]
     if settings.cameras:
         words += ["--cameras", bpy.path.abspath(settings.cameras)]
-    words += ["--path", str(folder / "camera_path.json"), "-o", str(images), "--overwrite", *settings.options.split()]
+    words += ["--path", str(folder / "camera_path.json"), "-o", str(images), "--overwrite"]
+    words += shlex.split(settings.options)
     try:
         done = subprocess.run(words, capture_output=True, text=True)
     except OSError as error:
         raise ValueError(f"{settings.program} cannot be started: {error}") from error
     if done.returncode:
-        raise ValueError((done.stderr or done.stdout).strip().splitlines()[-1])
-    digits = len(str(len(frames) - 1))
-    return [images / f"{index:0{digits}}.png" for index in range(len(frames))]
+        said = (done.stderr or done.stdout).strip().splitlines()[-1:]
+        raise ValueError("".join(said) or f"{settings.program} ended with status {done.returncode}")
+    return [image["file"] for image in json.loads(done.stdout)["images"]]
 
 
 def load(scene, files, first):
@@ -123,7 +134,7 @@ def load(scene, files, first):
     image = bpy.data.images.get(NAME)
     if image is not None:
         bpy.data.images.remove(image)
-    image = bpy.data.images.load(str(files[0]))
+    image = bpy.data.images.load(files[0])
     image.name = NAME
     image.source = "SEQUENCE" if len(files) > 1 else "FILE"
     user = _node(scene, image) if scene.aaplug.goal == "NODE" else _background(scene, image)
@@ -206,7 +217,7 @@ class Draw(bpy.types.Operator):
         scene = context.scene
         frames = frames_of(scene) if self.whole else [scene.frame_current]
         try:
-            load(scene, draw(scene, frames, bpy.path.abspath(scene.aaplug.folder)), frames[0])
+            load(scene, draw(scene, frames, scene.aaplug.folder), frames[0])
         except (ValueError, OSError, RuntimeError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
