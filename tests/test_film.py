@@ -171,8 +171,9 @@ def test_wrong_options_are_refused(case):
 
 def test_a_lens_that_bends_moves_but_has_no_aperture():
     panorama = replace(VIEW, lens=Lens("equirect"), fx=10.0, fy=10.0)
-    with pytest.raises(UsageError, match="an aperture needs"):
-        filmed([panorama], FilmOptions(f_stop=2.0, focus_distance=1.0), False)
+    for bent, got in ((panorama, "got equirect"), (replace(VIEW, lens=Lens(radial=(0.1,))), "got a distorted pinhole")):
+        with pytest.raises(UsageError, match=f"an aperture needs a pinhole without distortion, {got}"):
+            filmed([bent], FilmOptions(f_stop=2.0, focus_distance=1.0), False)
     renderer = aaplug.Renderer.of(make_scene(30), [VIEW], "matched", min_seen=0.0)
     moving = replace(
         panorama, exposure=Exposure(None, (panorama, replace(panorama, cam_from_world=MOVED.cam_from_world)), 4)

@@ -93,9 +93,8 @@ class Camera:
             object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
             self._check_pose()
             if self.lens != PINHOLE and self.exposure is not None and self.exposure.aperture is not None:
-                raise UsageError(
-                    "exposure", f"an aperture needs a pinhole lens without distortion, got {self.lens.projection}"
-                )
+                got = f"a distorted {self.lens.projection}" if self.lens.distorts else self.lens.projection
+                raise UsageError("exposure", f"an aperture needs a pinhole without distortion, got {got}")
         except UsageError as error:
             if error.where == "name" or not self.name:
                 raise
