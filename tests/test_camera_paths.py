@@ -72,7 +72,7 @@ def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
 
 
 BROKEN = {
-    "no path": ([], "no cameras of a known format"),
+    "no path": ([], "no camera path of a known format"),
     "a fisheye": (document(camera_type="fisheye"), "camera_type should be perspective"),
     "no frames": (document(camera_path=[]), "list of frames"),
     "no size": (document(render_width=0), "render_width"),

@@ -331,3 +331,5 @@ def test_garbage_is_refused(tmp_path):
         (tmp_path / name).write_bytes(b"\x00\x01garbage")
         with pytest.raises(AaplugError):
             read_camera_path(tmp_path / name)
+    with pytest.raises(FormatError, match="guide film-camera"):
+        read_camera_path(written(tmp_path, "a.abc", "Ogawa"))

@@ -123,6 +123,8 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     for format in PATH_FORMATS:
         if format.sniff(Path(path)):
             return format.path_of(Path(path))
+    if os.path.exists(path) and not holds_cameras(path):
+        raise FormatError(path, "holds no camera path of a known format; `aaplug guide film-camera` lists them")
     try:
         cameras = read_cameras(path, test_every=0)
     except UsageError:  # of files that give the split: training views, then test views

@@ -1,9 +1,8 @@
 """Cameras of glTF 2.0, .gltf and .glb: the first that an animation moves, or else the first.
 
 A perspective camera looks along -z with y up (OpenGL), at the place of its node, in the file's world; yfov is the
-vertical angle in rad, which an image of another shape keeps.  Of an animation, the motions of the camera's node and
-those above it are read.  The frame rate is that of the densest even keys, else 30 a second.  Focal lengths that
-KHR_animation_pointer moves stay.
+vertical angle in rad.  Of an animation, the motions of the camera's node and those above it are read.  The frame rate
+is that of the densest even keys, else 30 a second.  Focal lengths that KHR_animation_pointer moves stay.
 """
 
 from pathlib import Path
