@@ -188,6 +188,12 @@ def test_a_path_of_zero_length_is_refused():
         filmed([VIEW], FilmOptions(), False, camera_to=[VIEW])
 
 
+@pytest.mark.parametrize("end", [MOVED.scaled(0.5), replace(MOVED, lens=Lens("equidistant"))])
+def test_a_shutter_closes_at_the_views_size_and_lens(end):
+    with pytest.raises(UsageError, match="another size or kind of lens"):
+        filmed([VIEW], FilmOptions(), False, camera_to=[end])
+
+
 def test_through_a_fisheye_of_another_aspect_pixels_are_square_and_a_stretched_view_is_told(cli, monkeypatch):
     """A fisheye shows its angle along the shorter side."""
     shown = []

@@ -24,7 +24,7 @@ def filmed(
 
     views: at the size to draw; the frames of one motion in order, if `path`.
     options: they win over what the views say, and over `shutter`, which is of the path's file.
-    camera_to: for one view, the camera where the shutter closes, at the same size.
+    camera_to: for one view, the camera where the shutter closes, at the same size and through the same kind of lens.
 
     Raises UsageError if the focus lies behind a camera, nothing moves, or samples of nothing are asked for.
     """
@@ -40,6 +40,8 @@ def filmed(
             raise UsageError("camera_to", "names one view, for one view that is not of a path")
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
+        if (views[0].hw, views[0].lens.projection) != (camera_to[0].hw, camera_to[0].lens.projection):
+            raise UsageError("camera_to", "has another size or kind of lens than the view; give `resolution` or `lens`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
     elif shutter is not None and (len(views) > 1 or options.shutter is not None):
         if not path:
