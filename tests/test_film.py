@@ -189,9 +189,11 @@ def test_a_path_of_zero_length_is_refused():
 
 
 @pytest.mark.parametrize("end", [MOVED.scaled(0.5), replace(MOVED, lens=Lens("equidistant"))])
-def test_a_shutter_closes_at_the_views_size_and_lens(end):
-    with pytest.raises(UsageError, match="another size or kind of lens"):
+def test_a_motion_keeps_size_and_kind_of_lens(end):
+    with pytest.raises(UsageError, match=r"camera_to.*different sizes or lenses"):
         filmed([VIEW], FilmOptions(), False, camera_to=[end])
+    with pytest.raises(UsageError, match=r"shutter.*different sizes or lenses"):
+        filmed([VIEW, end], FilmOptions(shutter=0.5), True)
 
 
 def test_through_a_fisheye_of_another_aspect_pixels_are_square_and_a_stretched_view_is_told(cli, monkeypatch):

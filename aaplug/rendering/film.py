@@ -24,24 +24,27 @@ def filmed(
 
     views: at the size to draw; the frames of one motion in order, if `path`.
     options: they win over what the views say, and over `shutter`, which is of the path's file.
-    camera_to: for one view, the camera where the shutter closes, at the same size and through the same kind of lens.
+    camera_to: for one view, the camera where the shutter closes.
 
-    Raises UsageError if the focus lies behind a camera, nothing moves, or samples of nothing are asked for.
+    Raises UsageError if the focus lies behind a camera, nothing moves, sizes or kinds of lenses differ along a motion,
+    or samples of nothing are asked for.
     """
     shutter = shutter if options.shutter is None else options.shutter
     if options.samples == 0:
         return [replace(view, exposure=None) for view in views]
     apertures = [_aperture(view, options) for view in views]
     motions: Sequence[tuple[Camera, Camera]] = ()
-    if (camera_to or shutter is not None) and any(view.lens.projection == "ortho" for view in views):
-        raise UsageError("camera_to" if camera_to else "shutter", "moves perspective views; the lens is ortho")
+    option = "camera_to" if camera_to else "shutter"
+    kinds = {(view.hw, view.lens.projection) for view in (*views, *camera_to)}
+    if (camera_to or shutter is not None) and any(projection == "ortho" for _, projection in kinds):
+        raise UsageError(option, "moves perspective views; the lens is ortho")
+    if (camera_to or shutter is not None) and len(kinds) > 1:
+        raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
     if camera_to:
         if path or not len(views) == len(camera_to) == 1:
             raise UsageError("camera_to", "names one view, for one view that is not of a path")
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
-        if (views[0].hw, views[0].lens.projection) != (camera_to[0].hw, camera_to[0].lens.projection):
-            raise UsageError("camera_to", "has another size or kind of lens than the view; give `resolution` or `lens`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
     elif shutter is not None and (len(views) > 1 or options.shutter is not None):
         if not path:
@@ -50,7 +53,7 @@ def filmed(
         motions = _motions([_instant(view) for view in views], shutter)
     if motions and all(_still(*motion) for motion in motions):
         if camera_to or options.shutter is not None:
-            raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
+            raise UsageError(option, "finds no motion: the path has zero length")
         motions = ()  # the path's file has a shutter, and a camera that stands still
     if options.samples is not None and not any(apertures) and not motions and shutter is None:
         moving = "`shutter`" if path else "`camera_to`"
