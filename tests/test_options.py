@@ -11,7 +11,7 @@ import pytest
 from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
 
-from aaplug.options.base import Number, Options
+from aaplug.options.base import Number, Options, names
 from aaplug.system.errors import UsageError
 from tests.conftest import run_python
 
@@ -50,6 +50,10 @@ IDS = [f"{group.__name__}.{name}" for group, name, _ in NUMERIC]
 
 def test_the_options_are_found():
     assert len({name for _, name, _ in NUMERIC}) >= 18
+
+
+def test_values_stand_between_commas_with_or_without_spaces():
+    assert names("a", "b", "c", count=None).value(["a, b", "c,"]) == ("a", "b", "c")
 
 
 @pytest.mark.parametrize(("group", "name", "specs"), NUMERIC, ids=IDS)

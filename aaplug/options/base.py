@@ -57,7 +57,7 @@ class Argument:
     def value(self, words: Sequence[str]) -> Any:
         """The value that words give, several of them also between commas; raises ValueError."""
         if self.count is None:
-            words = [part for word in words for part in word.split(",") if part]
+            words = [part for word in words for part in map(str.strip, word.split(",")) if part]
         if not words or not all(words) or len(words) != (self.count or len(words)):
             raise ValueError(words)
         values = tuple(map(self.read, words))
