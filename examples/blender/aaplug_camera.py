@@ -49,7 +49,7 @@ def camera_path(scene, frames):
         "fps": render.fps / render.fps_base,
         "camera_path": poses,
     }
-    if render.use_motion_blur and len(poses) > 1:
+    if render.use_motion_blur and render.motion_blur_shutter > 0 and len(poses) > 1:
         path["shutter"] = min(1.0, render.motion_blur_shutter)
     return path
 
