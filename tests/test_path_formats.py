@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.io.cameras import read_camera_path
+from aaplug.io.cameras import read_camera_path, read_cameras
 from aaplug.system.errors import AaplugError, FormatError, UsageError
 from tests.test_cameras_io import FIXTURES
 
@@ -331,5 +331,7 @@ def test_garbage_is_refused(tmp_path):
         (tmp_path / name).write_bytes(b"\x00\x01garbage")
         with pytest.raises(AaplugError):
             read_camera_path(tmp_path / name)
+    with pytest.raises(FormatError, match="format of camera paths, which `path` of render and video takes"):
+        read_cameras(tmp_path / "a.usda")
     with pytest.raises(FormatError, match="guide film-camera"):
         read_camera_path(written(tmp_path, "a.abc", "Ogawa"))

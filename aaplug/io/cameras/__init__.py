@@ -108,6 +108,8 @@ def read_cameras(
                     raise
                 raise FormatError(path, str(error)) from error
             return replace(cameras, files=files_of(path, cameras))
+    if any(format.sniff(path) for format in PATH_FORMATS):
+        raise FormatError(path, "is of a format of camera paths, which `path` of render and video takes")
     signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 
