@@ -5,6 +5,7 @@ import math
 import struct
 import zlib
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import pytest
 import torch
 
 import aaplug
+from aaplug.core.camera_paths import up_of
+from aaplug.core.orbits import frame_of
 from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io import rad, streamed
@@ -204,7 +207,7 @@ def test_nothing_is_left_of_a_longer_run_that_was_cut_short(tmp_path, monkeypatc
 def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
     streamed.facts_file(tmp_path, 0).write_text(text)
     with pytest.raises(FormatError, match=f"parts_0.json.*{said}"):
-        streamed.write_index(tmp_path, "sog", 1, 1.0)
+        streamed.write_index(tmp_path, "sog", 1, 1.0, frame_of(SCENE))
 
 
 def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypatch):
@@ -259,7 +262,7 @@ def test_a_damaged_tree_is_refused(tmp_path):
         streamed.read_front(tmp_path, 0)
     (tmp_path / "0_0" / streamed.TREE).write_bytes(b"PK")
     with pytest.raises(FormatError, match=r"tree\.npz.*is damaged"):
-        streamed.write_index(tmp_path, "rad", 1, 1.0)
+        streamed.write_index(tmp_path, "rad", 1, 1.0, frame_of(SCENE))
 
 
 def test_levels_that_are_there_are_not_replaced(tmp_path):
@@ -316,7 +319,44 @@ def test_a_page_has_the_viewer_beside_it(tmp_path):
     assert (tmp_path / "out" / "viewer" / program.name).read_text() == program.read_text()
     assert f"./viewer/{program.name}" in page
     assert "http" not in page
+    assert "width=device-width" in page  # else a phone lays it out for 980 px
+    assert (tmp_path / "out" / "orbit.js").is_file()
+    view = json.loads((tmp_path / "out" / "settings.json").read_text())["view"]
+    assert view["up"] == pytest.approx(up_of(CAMERAS).tolist())
+    assert math.dist(view["centre"], SCENE.means.median(dim=0).values.tolist()) < view["radius"]
     assert not list((tmp_path / "out").glob("*.ply"))
+
+
+def test_a_page_turns_and_zooms_by_mouse_and_fingers(browser):
+    """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
+    script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()
+    page = browser.new_page()
+    eyes = page.evaluate(
+        """async (script) => {
+          const { orbit } = await import("data:text/javascript," + encodeURIComponent(script));
+          const canvas = document.body.appendChild(document.createElement("canvas"));
+          Object.assign(canvas, { width: 100, height: 200, setPointerCapture: () => {} });
+          const seen = orbit(canvas, { up: [1, 0, 0], front: [0, 1, 0], centre: [5, 0, 0], radius: 2 });
+          const point = (kind, pointerId, clientX, clientY = 0) =>
+            canvas.dispatchEvent(new PointerEvent("pointer" + kind, { pointerId, clientX, clientY }));
+          const eyes = [seen()];
+          point("down", 1, 0), point("move", 1, -100 * Math.PI), point("up", 1, 0), point("move", 1, 7);
+          eyes.push(seen());
+          point("down", 1, 0), point("down", 2, 10), point("move", 2, 20), point("up", 1, 0), point("up", 2, 0);
+          eyes.push(seen());
+          canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 1000 * Math.LN2 }));
+          return [...eyes, seen()];
+        }""",
+        script,
+    )
+    page.close()
+    first, turned, pinched, wheeled = (torch.tensor(eye["eye"]) - torch.tensor([5.0, 0.0, 0.0]) for eye in eyes)
+    far = 2 / math.sin(math.atan(math.tan(math.pi / 8) / 2))
+    torch.testing.assert_close(first, far * torch.tensor([math.sin(0.35), math.cos(0.35), 0.0]))
+    torch.testing.assert_close(turned, far * torch.tensor([math.sin(0.35), 0.0, math.cos(0.35)]))
+    torch.testing.assert_close(pinched, turned / 2)
+    torch.testing.assert_close(wheeled, turned)
+    assert all(eye["near"] < far / 100 and eye["far"] > 100 * far for eye in eyes)
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path):

@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.orbits import Frame
 from aaplug.core.placing import box_of
 from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
@@ -53,7 +54,7 @@ THREE = (
     "three/examples/jsm/postprocessing/Pass.js",
 )
 TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
-SETTINGS, PAGE = "settings.json", "index.html"
+SETTINGS, PAGE, ORBIT = "settings.json", "index.html", "orbit.js"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 FACTS = 7  # numbers that tell of a part: its size and its box
 
@@ -193,11 +194,12 @@ def front_folders(folder: Path) -> Iterator[Path]:
 
 
 def write_index(
-    folder: Path, name: StreamName, levels: int, rate: float, compensated: bool = True
+    folder: Path, name: StreamName, levels: int, rate: float, frame: Frame, compensated: bool = True
 ) -> Mapping[str, Any]:
     """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
-    rate: of training, in px per world unit.  compensated: levels are for a rule with compensation.
+    rate: of training, in px per world unit.  frame: what a page shows first.
+    compensated: levels are for a rule with compensation.
     """
     stream = STREAMS[name]
     if name == "rad":
@@ -209,8 +211,9 @@ def write_index(
         write = partial(_write_json, value=index)
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
+    view = {name: getattr(frame, name).tolist() for name in ("up", "front", "centre")} | {"radius": frame.radius}
     with replacing(folder / SETTINGS, overwrite=True) as target:
-        _write_json(target, settings)
+        _write_json(target, {**settings, "view": view})
     with replacing(folder / stream.index, overwrite=True) as target:  # last: it is the mark
         write(target)
     return settings
@@ -240,7 +243,7 @@ def programs_of(name: StreamName, modules: Path) -> list[Path]:
 
 
 def write_page(folder: Path, name: StreamName, modules: Path) -> None:
-    """Write index.html, which opens the levels, and the viewer's program into viewer/ beside it.
+    """Write index.html and orbit.js, which open the levels, and the viewer's program into viewer/ beside them.
 
     A browser reads them from a server, such as `python -m http.server`; nothing is fetched from elsewhere.
     """
@@ -253,8 +256,10 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
                 shutil.copy(program, viewer)
     except OSError as error:
         raise OutputError(viewer, f"cannot be written: {reason(error)}") from error
-    with replacing(folder / PAGE, overwrite=True) as stream:
-        stream.write(files(stream_pages).joinpath(f"{name}.html").read_bytes())
+    page, script = (files(stream_pages).joinpath(file).read_bytes() for file in (f"{name}.html", ORBIT))
+    for file, text in {ORBIT: script, PAGE: page}.items():
+        with replacing(folder / file, overwrite=True) as stream:
+            stream.write(text)
 
 
 class _Part(NamedTuple):
@@ -323,11 +328,11 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
 
 
 def _spark_settings(front: Front) -> dict[str, Any]:
-    """What Spark must be set to, so that its budget does not lower the detail, and where the scene is."""
+    """What Spark must be set to, so that its budget does not lower the detail."""
     leaves, rule = len(front.scene) - len(front.parents[front.parents >= 0].unique()), front.scene.convention
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.0, "blurAmount" if rule.compensated else "preBlurAmount": rule.kernel}
     budget = {"lodSplatCount": leaves, "lodRenderScale": MAX_NODE_SIZE}
-    return {"SparkRenderer": blur | budget, "bound": _bound(box_of(front.scene, 0.0))}
+    return {"SparkRenderer": blur | budget}
 
 
 def _box(parts: Sequence[_Part]) -> Box:

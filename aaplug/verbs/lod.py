@@ -12,9 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.camera_paths import up_of
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.gaussians import Gaussians, digest_of_scene, joined
+from aaplug.core.orbits import frame_of
 from aaplug.core.sampling import check_frame, median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
@@ -58,6 +60,7 @@ from aaplug.methods.conversion import fuse_for
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
+from aaplug.rendering.assumed import PROBE_ROWS
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
@@ -120,7 +123,9 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
                 rates = median_rates(whole.means, job.cameras.train)
                 compensated = maker.viewer is None or maker.viewer.convention_of(whole).compensated
                 rate = float(rates[rates > 0].median())
-                settings = write_index(path, options.to, len(levels), rate, compensated)
+                up = up_of(job.cameras).tolist()
+                frame = frame_of(job.scene.sample(PROBE_ROWS), up if any(up) else None)
+                settings = write_index(path, options.to, len(levels), rate, frame, compensated)
                 if options.page is not None:
                     write_page(path, options.to, Path(options.page))
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")

@@ -26,6 +26,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
+from aaplug.core.orbits import frame_of
 from aaplug.core.sampling import median_rates
 from aaplug.io import StreamName
 from aaplug.io.scenes import write_scene
@@ -93,7 +94,7 @@ def main(
             lighter = list(_decimated(whole, counts, work, command))
             for number, level in enumerate(lighter):
                 write_level(theirs, name, number, [level.scene])
-            write_index(theirs, name, len(lighter), float(rates[rates > 0].median()))
+            write_index(theirs, name, len(lighter), float(rates[rates > 0].median()), frame_of(lighter[0].scene))
         if name != "rad":
             shown["splat-transform"] = theirs, index, options
         if name == "sog":
@@ -123,7 +124,7 @@ def _options(name: StreamName, settings: Mapping[str, Any]) -> dict[str, Any]:
         return settings["Cesium3DTileset"]
     if name == "rad":
         return settings["SparkRenderer"]
-    engine, component, distance, _ = settings.values()
+    engine, component, distance, *_ = settings.values()
     return {**engine, "component": component, "distancePerPixel": distance}
 
 

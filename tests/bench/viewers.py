@@ -27,6 +27,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
+from aaplug.core.orbits import frame_of
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image
@@ -70,7 +71,7 @@ class Page:
         shown.mkdir(parents=True, exist_ok=True)
         if self.file == TILES:
             write_level(shown, "3dtiles", 0, [scene])  # as one tile
-            write_index(shown, "3dtiles", 1, 1.0)
+            write_index(shown, "3dtiles", 1, 1.0, frame_of(scene))
         else:
             write_scene(shown / self.file, scene, overwrite=True)
         return shoot(self.name, shown, self.file, self.options, views, work)
