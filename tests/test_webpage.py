@@ -1,7 +1,12 @@
-"""The report: one page that holds everything, escapes every name, and works by mouse and by keyboard in a browser."""
+"""The report: one page that holds everything, escapes every name, and works by mouse and by keyboard in a browser.
 
+And the camera of the pages that open streamed levels.
+"""
+
+import math
 import re
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import parse_qs, urlsplit
@@ -9,6 +14,7 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 import numpy as np
 import pytest
+import torch
 from markupsafe import escape
 
 from aaplug.core.cameras import CameraSet
@@ -322,3 +328,35 @@ def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
     paper, ink = (0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in linear)
     assert (paper > ink) == (scheme == "light")
     assert (max(paper, ink) + 0.05) / (min(paper, ink) + 0.05) > 7  # WCAG's AAA
+
+
+def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
+    """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
+    script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()
+    page = browser.new_page()
+    eyes = page.evaluate(
+        """async (script) => {
+          const { orbit } = await import("data:text/javascript," + encodeURIComponent(script));
+          const canvas = document.body.appendChild(document.createElement("canvas"));
+          Object.assign(canvas, { width: 100, height: 200, setPointerCapture: () => {} });
+          const seen = orbit(canvas, { up: [1, 0, 0], front: [0, 1, 0], centre: [5, 0, 0], radius: 2 });
+          const point = (kind, pointerId, clientX, clientY = 0) =>
+            canvas.dispatchEvent(new PointerEvent("pointer" + kind, { pointerId, clientX, clientY }));
+          const eyes = [seen()];
+          point("down", 1, 0), point("move", 1, -100 * Math.PI), point("up", 1, 0), point("move", 1, 7);
+          eyes.push(seen());
+          point("down", 1, 0), point("down", 2, 10), point("move", 2, 20), point("up", 1, 0), point("up", 2, 0);
+          eyes.push(seen());
+          canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 1000 * Math.LN2 }));
+          return [...eyes, seen()];
+        }""",
+        script,
+    )
+    page.close()
+    first, turned, pinched, wheeled = (torch.tensor(eye["eye"]) - torch.tensor([5.0, 0.0, 0.0]) for eye in eyes)
+    far = 2 / math.sin(math.atan(math.tan(math.pi / 8) / 2))
+    torch.testing.assert_close(first, far * torch.tensor([math.sin(0.35), math.cos(0.35), 0.0]))
+    torch.testing.assert_close(turned, far * torch.tensor([math.sin(0.35), 0.0, math.cos(0.35)]))
+    torch.testing.assert_close(pinched, turned / 2)
+    torch.testing.assert_close(wheeled, turned)
+    assert all(eye["near"] < far / 100 and eye["far"] > 100 * far for eye in eyes)
