@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -83,7 +84,8 @@ def test_the_integers_that_the_extension_allows_are_read(tmp_path: Path):
 
 
 WRONG = {
-    "outside of the folder": (("buffers", 0, "uri"), "../a.bin", "a file in the same folder"),
+    "outside of the folder": (("buffers", 0, "uri"), "..%2Fa.bin", "a file in the same folder"),
+    "a file that is not there": (("buffers", 0, "uri"), "b%20c.bin", "b.gltf: refers to b c.bin, which is not there"),
     "a required extension": (("extensionsRequired",), ["EXT_meshopt_compression"], "extensionsRequired should be of"),
     "an unlike scale": (("nodes",), [{"mesh": 0, "scale": [1, 2, 1]}], "a turn, a move and one scale"),
     "a mirror": (("nodes",), [{"mesh": 0, "scale": [1, 1, -1]}], "a turn, a move and one scale"),
@@ -116,13 +118,15 @@ def test_what_cannot_be_read_right_is_refused(tmp_path: Path, what: str):
 
 def test_a_gltf_is_replaced_with_its_buffer(tmp_path: Path):
     scene = replace(oracle(), origin=None)
-    write_scene(tmp_path / "a.gltf", scene)
-    [first] = tmp_path.glob("a-*.bin")
-    write_scene(tmp_path / "a.gltf", scene[:10], overwrite=True)
-    [second] = tmp_path.glob("a-*.bin")
+    path = tmp_path / "a é#1%20.gltf"
+    write_scene(path, scene)
+    [first] = tmp_path.glob("a*.bin")
+    write_scene(path, scene[:10], overwrite=True)
+    [second] = tmp_path.glob("a*.bin")
     assert first != second
-    assert read_scene(tmp_path / "a.gltf").others == (second,)
-    assert len(read_scene(tmp_path / "a.gltf").gaussians()) == 10
+    assert re.fullmatch(r"a%20%C3%A9%231%2520-\w+\.bin", json.loads(path.read_text())["buffers"][0]["uri"])
+    assert read_scene(path).others == (second,)
+    assert len(read_scene(path).gaussians()) == 10
 
 
 def test_images_that_another_index_of_the_folder_names_stay(tmp_path: Path):

@@ -266,9 +266,9 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     }"""
     one.evaluate(drop, ["bad.ply", b64encode(b"no scene").decode()])
     one.locator("#said", has_text="bad.ply").wait_for()
-    write_scene(tmp_path / "other.ply", make_scene(700))
-    one.evaluate(drop, ["other.ply", b64encode((tmp_path / "other.ply").read_bytes()).decode()])
-    one.locator("#said", has_text="opened other.ply").wait_for()
+    write_scene(tmp_path / "other ☃'s.ply", make_scene(700))
+    one.evaluate(drop, ["other ☃'s.ply", b64encode((tmp_path / "other ☃'s.ply").read_bytes()).decode()])
+    one.locator("#said", has_text="opened other ☃'s.ply").wait_for()
     at_rest(one)
     assert one.inner_text("#facts").startswith("700 Gaussians")
     assert two.inner_text("#facts").startswith("200 Gaussians")
@@ -277,10 +277,12 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     one.reload()
     at_rest(one)
     assert state(one)["pose"] == state(two)["pose"]  # the server's scene, without the camera of the other
-    with serving(tmp_path / "other.ply", seen[1], port=0, rasterizer="eager") as address:
+    with serving(tmp_path / "other ☃'s.ply", seen[1], port=0, rasterizer="eager") as address:
         three = opened(where=address, as_opened=True)
-        three.evaluate(drop, ["other.ply", b64encode((tmp_path / "other.ply").read_bytes()).decode()])
-        three.locator("#said", has_text="opened other.ply").wait_for()  # of that name and count, but without cameras
+        three.evaluate(drop, ["other ☃'s.ply", b64encode((tmp_path / "other ☃'s.ply").read_bytes()).decode()])
+        three.locator(
+            "#said", has_text="opened other ☃'s.ply"
+        ).wait_for()  # of that name and count, but without cameras
         assert "training rate assumed" in three.inner_text("#facts")
         three.close()
 

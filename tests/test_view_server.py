@@ -179,6 +179,10 @@ def test_a_page_that_asks_without_reading_is_cut_off(seen, monkeypatch):  # noqa
     [
         ({"name": "../a.ply", "size": 3}, [], "takes the name of a scene file"),
         ({"name": "/etc/passwd", "size": 3}, [], "takes the name of a scene file"),
+        ({"name": 100 * "é" + 100 * "e", "size": 3}, [], "takes the name of a scene file"),
+        ({"name": "C:a\\b.ply", "size": 3}, [], "takes the name of a scene file"),
+        ({"name": ".a.ply", "size": 3}, [], "takes the name of a scene file"),
+        ({"name": "a.ply", "size": 0}, [], "a.ply: is empty"),
         ({"name": "a.ply", "size": 2**50}, [], "more than the temporary folder takes"),
         ({"name": "a.ply", "size": 3}, [b"ab", b"cd"], "longer than it was announced"),
         ({"name": "a.ply", "size": 4}, [b"ab", b"cd"], "a.ply: "),

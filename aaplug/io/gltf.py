@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -169,9 +170,11 @@ class Gltf:
                 raise buffer.place.wrong("uri", "Base64", address[:40]) from error
             return Buffer(self.path, len(held), 0, held)
         try:
-            file, home = (self.path.parent / address).resolve(), self.path.parent.resolve()
+            file, home = (self.path.parent / unquote(address)).resolve(), self.path.parent.resolve()
             buffer.place.expect(file.is_relative_to(home), "uri", "a file in the same folder", address)
             size = file.stat().st_size
+        except FileNotFoundError as error:
+            raise FormatError(self.path, f"refers to {unquote(address)}, which is not there") from error
         except (OSError, RuntimeError, ValueError) as error:
             raise buffer.place.wrong("uri", "a file's name", address) from error
         if file not in self.files:

@@ -25,7 +25,8 @@ MAX_SIDE = 8192  # px of a picture
 MAX_PIXELS = 1 << 25  # of a picture
 MAX_DISTANCE = 1e9  # world units, and px of a focal length
 MAX_ID = 2**53  # a page counts in float64
-FILE_NAME = r"\w[\w .()+-]{0,99}\.\w{1,9}"
+FILE_NAME = r"[^./\\:][^/\\:]*"  # on any system
+MAX_NAME_BYTES = 255
 POSE_NUMBERS = 16  # row by row
 
 
@@ -119,9 +120,12 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
         raise UsageError(kind, f"takes an object, got {_short(body)}")
     if kind == "open":
         name = body.get("name")
-        if not isinstance(name, str) or not re.fullmatch(FILE_NAME, name):
+        if not isinstance(name, str) or not _is_file_name(name):
             raise UsageError("name", f"takes the name of a scene file, got {_short(name)}")
-        return OpenRequest(name, _whole(body, "size", 1, MAX_ID))
+        size = _whole(body, "size", 0, MAX_ID)
+        if not size:
+            raise UsageError(name, "is empty")
+        return OpenRequest(name, size)
     if kind == "pick":
         return PickRequest(_number(body, "x", 0.0, 1.0), _number(body, "y", 0.0, 1.0))
     width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))
@@ -170,6 +174,10 @@ def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> fl
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
         raise UsageError(name, f"takes a number from {least:g} to {most:g}, got {_short(value)}")
     return float(value)
+
+
+def _is_file_name(name: str) -> bool:
+    return bool(re.fullmatch(FILE_NAME, name)) and name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES
 
 
 def _whole(body: Mapping[str, Any], name: str, least: int, most: int) -> int:

@@ -17,6 +17,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -258,7 +259,7 @@ class _Document:
             "scenes": [{"nodes": [0]}],
             "nodes": [{"mesh": 0}],
             "meshes": [{"primitives": [primitive]}],
-            "buffers": [{"byteLength": self.size if blob is None else blob} | ({"uri": uri} if uri else {})],
+            "buffers": [{"byteLength": self.size if blob is None else blob} | ({"uri": quote(uri)} if uri else {})],
             "bufferViews": views,
             "accessors": accessors,
         }

@@ -45,7 +45,7 @@ function hello(facts) {
   document.title = `${facts.title} · aaplug`;
   at("title").textContent = facts.title;
   const kernels = facts.rasterizer === "compiled" ? "" : `, rasterizer ${facts.rasterizer}: \`aaplug warmup\` makes it faster`;
-  at("facts").textContent = `${facts.gaussians.toLocaleString("en")} Gaussians${facts.assumed ? ", training rate assumed" : ""}${kernels}`;
+  at("facts").textContent = `${facts.gaussians.toLocaleString("en")} Gaussian${facts.gaussians === 1 ? "" : "s"}${facts.assumed ? ", training rate assumed" : ""}${kernels}`;
   for (const i of [0, 1]) {
     listed(`recipe-${i}`, facts.recipes.map(({name}) => name));
     listed(`quality-${i}`, facts.qualities);
