@@ -79,6 +79,20 @@ def test_a_gaussian_far_away_that_moves_others_is_told(tmp_path: Path, caplog, s
     assert re.search(r"b\.\S+: the steps of .*, move \d+ of \d+ Gaussians by more than their size", caplog.text)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "ends"), [("spz", (-10, 5.9375)), ("spz.glb", (-10, 5.9375)), ("compressed.ply", (-20, 20))]
+)
+def test_a_scene_of_units_that_a_format_has_no_sizes_for_is_told(tmp_path: Path, caplog, suffix: str, ends):
+    scene = replace(oracle(), origin=None)
+    for number, end in enumerate(ends):
+        for beyond in (False, True):
+            caplog.clear()
+            scene.log_scales[:] = torch.tensor([end, -40.0, -40.0])
+            scene.log_scales[:, 0] += (-0.01, 0.01)[number] if beyond else 0
+            write_scene(tmp_path / f"a.{suffix}", scene, overwrite=True)
+            assert ("cannot hold 40 of 40 Gaussians of another size than" in caplog.text) is beyond
+
+
 @pytest.fixture
 def expected() -> Gaussians:
     return oracle()
@@ -299,7 +313,7 @@ def test_a_splat_says_what_it_loses(tmp_path: Path, expected, caplog):
     assert not caplog.text
     write_scene(tmp_path / "rich.splat", replace(expected, convention=MIP))
     [record] = caplog.records
-    assert "cannot hold harmonics of degrees 1 to 3 and the record of its training (mip); a .ply can" in record.message
+    assert "cannot hold harmonics above degree 0 and the record of its training (mip); a .ply can" in record.message
 
 
 def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):

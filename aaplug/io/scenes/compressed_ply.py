@@ -23,7 +23,7 @@ from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_la
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
-from aaplug.io.scenes.record import warn_of_moves, whole
+from aaplug.io.scenes.record import warn_of_moves, warn_of_sizes, whole
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
@@ -145,6 +145,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     steps = torch.tensor([(1 << bits) - 1 for _, bits in ELEVEN_TEN_ELEVEN])
     span = (bounds[0][:, 3:] - bounds[0][:, :3])[chunk]
     warn_of_moves(path, name, [(scene, ((shares[0] * steps).round() / steps - shares[0]) * span)])
+    warn_of_sizes(path, name, [scene], -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     rest, largest = without_largest(scene.unit_quats)
     turns = _word(rest / 2**0.5 + 0.5, (20, 10), (10, 10), (0, 10)) | largest << 30
     rgba = torch.cat([shares[2], scene.opacities[:, None]], dim=1)

@@ -5,10 +5,12 @@ format's own tag or in the record, and a warning names what reading the file aga
 """
 
 import logging
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -90,6 +92,15 @@ def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Floa
     if far > MOVED_SHARE * count:
         what = f"move {far:,} of {counted(count, 'Gaussian')} by more than their size"
         log.warning("%s: the steps of a .%s, as wide as the scene, %s; a .ply has none", path, format, what)
+
+
+def warn_of_sizes(path: Path, format: str, parts: Sequence[Gaussians], least: float, most: float) -> None:
+    """Warn where Gaussians are smaller or larger than a format holds; least, most: of its log-scales."""
+    sizes, ends = torch.cat([part.log_scales.amax(dim=1) for part in parts]), (math.exp(least), math.exp(most))
+    odd = int(((sizes < least) | (sizes > most)).sum())
+    if odd > MOVED_SHARE * len(sizes):
+        what = f"{odd:,} of {counted(len(sizes), 'Gaussian')} of another size than {ends[0]:.3g} to {ends[1]:.3g} units"
+        log.warning("%s: a .%s cannot hold %s; scale the scene by aaplug merge, or write a .ply", path, format, what)
 
 
 def warn_of_losses(path: Path, format: str, scene: Gaussians, kept: Facts, also: Iterable[str] = ()) -> None:

@@ -50,7 +50,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     with replacing(path, overwrite) as stream:
         for number, part in enumerate(parts):
             if not number:
-                lost = [f"harmonics of degrees 1 to {part.sh_degree}"] if part.sh_degree else []
+                lost = ["harmonics above degree 0"] if part.sh_degree else []
                 warn_of_losses(path, name, part, Facts(EVIDENCE), lost)
             stream.write(_records(holdable(path, part, name, MOST_DEGREE)).tobytes())
         if not stream.tell():

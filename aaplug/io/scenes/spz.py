@@ -40,7 +40,7 @@ from aaplug.io.scenes.packed import (
     largest_last,
     without_largest,
 )
-from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves
+from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves, warn_of_sizes
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
@@ -279,6 +279,7 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     warn_of_moves(
         path, name, [(part, (part.means * 2**fraction).round() / 2**fraction - part.means) for part in scenes]
     )
+    warn_of_sizes(path, name, scenes, MIN_LOG_SCALE, MIN_LOG_SCALE + 255 / SCALE_STEPS)
     sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
     flags = ANTIALIASED_FLAG * first.convention.compensated
     facts = version, count, first.sh_degree, fraction
