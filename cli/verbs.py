@@ -119,7 +119,8 @@ def lod(words: Words) -> Answer:
         return for_each_scene(words, lambda scene: ".ply" if scene.of(verbs.LodOptions).single else "")
     scene, cameras = read_inputs(words)
     levels = aaplug.lod(scene, cameras, words.output, **told(words, verbs.LodOptions))
-    say(f"wrote {words.output}: {' > '.join(f'{len(level.scene):,}' for level in levels)} Gaussians")
+    *finer, last = (len(level.scene) for level in levels)
+    say(f"wrote {words.output}: {' > '.join([*(f'{count:,}' for count in finer), counted(last, 'Gaussian')])}")
     counts = [{"rate": level.rate, "gaussians": len(level.scene)} for level in levels]
     return Answer({"output": str(words.output), "gaussians": scene.count, "levels": counts})
 

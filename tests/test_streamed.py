@@ -228,16 +228,17 @@ def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypat
         assert place == (written[tuple(SCENE.means[parent].tolist())] if parent >= 0 else 0)
 
 
-@pytest.mark.parametrize("scene", ["faint", "large, of degree 4", "in float64"])
+@pytest.mark.parametrize("scene", ["faint", "large, of degree 4", "in float64", "large, alone"])
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
     given = {
         "faint": replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20),
         "large, of degree 4": replace(make_scene(400, degree=4), log_scales=SCENE.log_scales + 3),
         "in float64": SCENE.to(torch.float64),
+        "large, alone": replace(SCENE, log_scales=SCENE.log_scales + 3)[:1],
     }[scene]
     levels = aaplug.lod(given, CAMERAS, tmp_path, to="rad", levels=3, refine=False, min_seen=0.0)
-    assert len(levels[0].scene) == 400
-    assert read_rad(tmp_path / "scene.rad")["child_count"][:, 0].max() > 0
+    assert len(levels[0].scene) == len(given)
+    assert bool(read_rad(tmp_path / "scene.rad")["child_count"].max() > 0) is (len(given) > 1)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.rad", streamed.SETTINGS}
 
 

@@ -144,7 +144,7 @@ def _properties(tree: Tree, spans: Mapping[str, float]) -> Iterator[tuple[dict[s
         return {"property": name, "encoding": encoding}, values.t().contiguous().numpy()
 
     scene, half, quats = tree.scene, torch.float16, tree.scene.unit_quats
-    bytes_apart = scene.means.float().t().contiguous().view(torch.uint8).view(-1, 4)  # of each float the lowest first
+    bytes_apart = scene.means.float().t().flatten().view(torch.uint8).view(-1, 4)  # of each float the lowest first
     yield property_of("center", "f32_lebytes", bytes_apart)
     yield property_of("alpha", "f16", scene.opacities.to(half))
     yield property_of("rgb", "f16", scene.base_colours.to(half))
