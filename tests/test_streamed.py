@@ -298,6 +298,7 @@ def test_parts_of_an_earlier_run_are_removed_and_nothing_else(tmp_path, small_le
 
 @pytest.mark.parametrize(("to", "viewer"), [(to, stream.viewer) for to, stream in streamed.STREAMS.items()])
 def test_parts_are_for_their_viewer_also_without_tuning(tmp_path, to, viewer):
+    assert {"sog": "sog", "3dtiles": "spz.glb", "rad": "ply"}[to] in VIEWERS[viewer].formats
     made(tmp_path / "out", to)
     for folder in streamed.part_folders(tmp_path / "out", to):
         assert read_scene(folder / streamed.STREAMS[to].content).convention == VIEWERS[viewer].convention

@@ -199,7 +199,7 @@ VIEWERS: Registry[Viewer] = Registry(
                 cut=ROOT_8,
                 floor=0.0,
                 levels="geometric error of a tile over distance (maximumScreenSpaceError)",
-                formats=("glb",),
+                formats=("glb", "spz.glb"),
                 smallest=SMALLEST,
             ),
             _mkkellogg("mkkellogg", ANTIALIASED, "antialiased: true, "),
