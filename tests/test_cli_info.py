@@ -80,6 +80,13 @@ def test_info_names_problems(tmp_path: Path, kind: str, words: str):
     assert words in problem
 
 
+@pytest.mark.parametrize("column", ["log_scales", "logit_opacities"])
+def test_few_gaussians_may_all_have_values_of_activated_ones(tmp_path: Path, column: str):
+    scene = make_scene(3)
+    write_scene(tmp_path / "in.ply", replace(scene, **{column: torch.full_like(getattr(scene, column), 0.5)}))
+    assert info(tmp_path / "in.ply")["problems"] == []
+
+
 def test_limits_are_printed(cli, monkeypatch):
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "123")
     assert json.loads(cli("info --limits --json")[1])["GAUSSIANS"] == 123

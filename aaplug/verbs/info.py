@@ -22,6 +22,7 @@ from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import looks
 
 MAX_LOG_SCALE = 20.0  # larger ones are taken for scales
+MIN_JUDGED = 10  # Gaussians: of fewer, all values may lie as activated ones do
 MIN_STEPS = 1e4  # of float32 across the scene's extent: with fewer, positions are coarse
 PICTURE_SIDES = (3840, 1920, 1280, 640, 320)  # px: longer sides of pictures of the whole scene
 SPECTRUM_ROWS = 20  # Gaussians read at each place of the file, of which the splats' energy is taken
@@ -135,9 +136,10 @@ def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iter
         yield "the scene is empty: check that it is the right file"
     if not statistics.count:
         return
-    if statistics.largest > MAX_LOG_SCALE or statistics.above_zero == statistics.count:
+    judged = max(statistics.count, MIN_JUDGED)
+    if statistics.largest > MAX_LOG_SCALE or statistics.above_zero == judged:
         yield "scales look already exponentiated (they should be logarithms): export the scene again"
-    elif statistics.activated == statistics.count:
+    elif statistics.activated == judged:
         yield "opacities look already activated, all in [0, 1] (they should be logits): export the scene again"
     if statistics.filtered:
         yield "its filter_3D is not fused, and viewers ignore it: `aaplug convert` fuses it"
