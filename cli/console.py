@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -33,7 +34,13 @@ def show(things: Iterable[Any]) -> None:
     from rich.console import Console
 
     for each in things:
-        print(printable(each)) if isinstance(each, str) else Console(highlight=False).print(each)
+        if isinstance(each, str):
+            print(printable(each))
+            continue
+        console = Console(highlight=False)
+        with console.capture() as drawn:  # rich would end the program where the reader of stdout has gone
+            console.print(each)
+        print(drawn.get(), end="")
 
 
 def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
@@ -84,6 +91,8 @@ class _Warnings(logging.Handler):
 
 def set_up() -> None:
     """Send the library's warnings to the log, and write names that are not UTF-8 in escaped form."""
+    if os.environ.get("COLUMNS") == "0":  # of terminals that do not know; rich would print nothing
+        del os.environ["COLUMNS"]
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -8,11 +8,12 @@ import gc
 import json
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from shutil import get_terminal_size
 from textwrap import fill
+from typing import TextIO
 
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
@@ -30,19 +31,18 @@ UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the program and exit."""
+    sys.stdout, sys.stderr = (stream or _nowhere() for stream in (sys.stdout, sys.stderr))  # closed: `>&-`
     try:
-        code = _guarded(list(sys.argv[1:] if words is None else words))
-        sys.stdout.flush()
-        sys.exit(code)
+        sys.exit(_guarded(list(sys.argv[1:] if words is None else words)))
     except KeyboardInterrupt:
         with suppress(OSError):  # its terminal has closed
             print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
         of_output = error.filename is None and error.errno in UNWRITABLE
-        if of_output:  # its reader has gone, or the disk is full; flush nothing at exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):
+        if of_output:  # the disk is full; flush nothing at exit
+            _drop_output()
+        if isinstance(error, BrokenPipeError):  # of the log
             sys.exit(FAILED)
         where = error.filename or ("output" if of_output else f"unexpected {type(error).__name__}")
         print(f"error: {printable(f'{where}: {reason(error)}')}", file=sys.stderr)
@@ -63,10 +63,33 @@ def program() -> None:
         os._exit(end.code if isinstance(end.code, int) else FAILED if end.code else 0)
 
 
+@contextmanager
+def _printing(code: int = 0) -> Iterator[None]:
+    """Print on stdout; end with `code` where its reader has enough, as `head` has."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _drop_output()
+        sys.exit(code)
+
+
+def _nowhere() -> TextIO:
+    return os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+
+
+def _drop_output() -> None:
+    with _nowhere() as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+
+
 def _guarded(words: Sequence[str]) -> int:
     """Run one verb; mistakes of the user become a line on stderr and an exit code."""
     if words == ["--version"]:
-        print(f"aaplug {version('aaplug')}")
+        with _printing():
+            print(f"aaplug {version('aaplug')}")
         return 0
     from . import console
 
@@ -88,16 +111,20 @@ def run(words: Sequence[str]) -> int:
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
         with command.errors("aaplug"):
-            given = command.parse(words[1:])
+            with _printing():  # --help
+                given = command.parse(words[1:])
             several = given.values.get("batch") is not None  # then each scene's are checked with its file
             answer = command.run(given if several else given.checked())
-        if given.values.get("json"):
-            print(json.dumps(answer.facts, indent=1, allow_nan=False))
-        elif answer.shown:
-            console.show(answer.shown)
-        return FAILED if answer.failed else 0
+        code = FAILED if answer.failed else 0
+        with _printing(code):
+            if given.values.get("json"):
+                print(json.dumps(answer.facts, indent=1, allow_nan=False))
+            elif answer.shown:
+                console.show(answer.shown)
+        return code
     if words and words[0] in ("-h", "--help"):
-        show_verbs()
+        with _printing():
+            show_verbs()
         return 0
     if not words:
         problem = f"name a verb: {', '.join(VERBS)}"

@@ -14,6 +14,7 @@ from plyfile import PlyData
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import EYES, SIZE, make_camera, make_scene
+from tests.test_startup import START
 
 # what works
 
@@ -212,16 +213,25 @@ def inria_model(folder: Path, config: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("entry", ["main", "program"])
-def test_a_reader_that_leaves_early_sees_no_traceback(entry):
-    program = f"from aaplug_cli.main import {entry}; {entry}()"
-    words = [sys.executable, "-c", program, "render", "--help"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [("main", "render --help"), ("program", "render --help"), ("main", "recipes"), ("program", "--version")],
+)
+def test_a_reader_that_leaves_early_is_no_failure(entry, words):
+    program = [sys.executable, "-c", f"from aaplug_cli.main import {entry}; {entry}()", *words.split()]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
         assert run.stderr is not None
         run.stdout.close()
         err = run.stderr.read()
-    assert (run.returncode, err) == (1, "")
+    assert (run.returncode, err) == (0, "")
+
+
+@pytest.mark.parametrize(("closed", "words", "code"), [(1, "recipes", 0), (2, "recipes", 0), (2, "render", 2)])
+def test_a_stream_that_the_caller_closed_is_written_nowhere(closed, words, code):
+    program = f"import os; os.close({closed}); os.execv({sys.executable!r}, ['python', '-c', {START!r}, {words!r}])"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (run.returncode, "Traceback" in run.stderr, bool(run.stdout)) == (code, False, (closed, code) == (2, 0))
 
 
 @pytest.mark.parametrize(("words", "code"), [(["info", "scene.ply", "--json"], 0), (["info", "none.ply"], 2)])

@@ -116,6 +116,8 @@ def test_the_table_of_recipes_has_every_one_and_marks_those_for_comparison(cli, 
     assert [each["name"] for each in facts if not each["comparison"]] == names_of("recipe", comparisons=False)
 
 
-def test_no_table_cuts_a_name_off(cli, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
-    assert "…" not in cli("recipes")[1]
+@pytest.mark.parametrize("columns", ["60", "0"])  # 0: a terminal that does not know
+def test_no_table_cuts_a_name_off(cli, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    shown = cli("recipes")[1]
+    assert ("…" in shown, "matched" in shown) == (False, True)

@@ -39,7 +39,7 @@ def test_escapes_of_a_file_do_not_reach_the_terminal(cli):
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="there is no device that is always full")
-@pytest.mark.parametrize("words", ["info scene.ply --json", "--version"])
+@pytest.mark.parametrize("words", ["info scene.ply --json", "recipes", "--version"])
 def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):
     program = [sys.executable, "-c", "from aaplug_cli.main import main; main()", *words.split()]
     with FULL.open("w") as full:
