@@ -160,6 +160,15 @@ def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
     assert read_cfg_args(tmp_path / "cfg_args").resolution == 2
 
 
+def test_where_training_had_its_photos_is_told_and_not_read(tmp_path):
+    photo(tmp_path / "data" / "images" / "a.png", 400, 200)
+    root = inria(tmp_path / "model", cfg=f"Namespace(source_path={str(tmp_path / 'data')!r})")
+    note = f"photos: none found; training had them in {tmp_path / 'data'}/images; `images` names a folder"
+    assert read_cameras(root).notes[-1] == note
+    found = read_cameras(root, images=str(tmp_path / "data" / "images"))
+    assert (found.train[0].photo is not None, note in found.notes) == (True, False)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -396,12 +405,16 @@ def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
     colmap_bin(root / "sparse")
     (root / "images").mkdir()
     (root / "images" / "a.b.png").symlink_to(tmp_path / "elsewhere" / "a.b.png")
-    refused(root, "lies outside")
+    refused(root, "lies outside", "; pass `images` to allow another folder, or where a link leads there, copy it, or")
     (root / "images" / "a.b.png").unlink()
     (root / "images").rmdir()
     (root / "images").symlink_to(tmp_path / "elsewhere")
     refused(root, "lies outside")
     assert read_cameras(root, images=str(tmp_path / "elsewhere")).test[0].photo is not None
+    linked = blender(tmp_path / "blender")
+    (linked / "train").rename(tmp_path / "moved")
+    (linked / "train").symlink_to(tmp_path / "moved")
+    refused(linked, "; where a link leads there, copy it, or link the whole data set")
 
 
 def test_folder_of_photos_must_exist_and_hold_some(tmp_path):
@@ -718,7 +731,7 @@ def test_views_are_chosen_by_split_or_name(tmp_path):
     assert select_views(cameras, "train") == cameras.train
     assert select_views(cameras, "test") == cameras.test
     assert len(select_views(cameras, "all")) == 17
-    assert names(select_views(cameras, "v08, v01,v08")) == ["v08", "v01"]
+    assert names(select_views(cameras, "v08, v01,v08,v01.jpg")) == ["v08", "v01"], "a photograph's name is its view's"
     with pytest.raises(UsageError, match=r"views: there is no view 'v1'.*v1"):
         select_views(cameras, "v01,v1")
     with pytest.raises(UsageError):

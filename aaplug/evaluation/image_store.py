@@ -13,8 +13,8 @@ from aaplug.core.cameras import Camera
 from aaplug.evaluation.metric import Image
 from aaplug.evaluation.results import CEILING, method
 from aaplug.io.atomic import make_folder
+from aaplug.io.cameras import view_names
 from aaplug.io.images import write_png
-from aaplug.system.errors import UsageError
 
 RENDERS, TRUTHS = "renders", "gt"
 REPORT_FOLDER, TEST_FOLDER = "images", "test"
@@ -39,10 +39,8 @@ class ImageStore:
             count = min(int(show), len(views))
             return cls(folder, tuple(i * len(views) // count for i in range(count)), everything)
         places = {view.name: place for place, view in enumerate(views)}
-        for name in show.split(","):
-            if name not in places:
-                raise UsageError("show", f"there is no view '{name}' among those evaluated")
-        return cls(folder, tuple(places[name] for name in show.split(",")), everything)
+        names = view_names(places, show, "show", "a number, or names of views that are measured,")
+        return cls(folder, tuple(places[name] for name in names), everything)
 
     def keep(self, view: int, recipe: str, scale: float, image: Image, truth: Image | None) -> None:
         """Store one image and its truth, wherever they belong."""

@@ -7,6 +7,7 @@ an entry point in the group "aaplug.camera_formats" (see `core.registry`).  `rea
 
 import difflib
 import os
+from collections.abc import Collection
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -28,7 +29,7 @@ from aaplug.io.cameras import (
     usd,
 )
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.photos import files_of
+from aaplug.io.cameras.photos import files_of, without_suffix
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, UsageError, listing
@@ -151,10 +152,19 @@ def select_views(cameras: CameraSet, spec: str, option: str = "views") -> tuple[
             raise UsageError(option, f"{spec} has no views; the cameras have {len(cameras.all)} in all")
         return groups[spec]
     known = {camera.name: camera for camera in (*cameras.train, *cameras.test)}
+    return tuple(known[name] for name in view_names(known, spec, option, "train, test, all or names"))
+
+
+def view_names(known: Collection[str], spec: str, option: str, takes: str) -> list[str]:
+    """Those of the known names that `spec` lists between commas, each once; `r_0.png`, of a photograph, is `r_0`.
+
+    option: that `spec` is of, and what it takes, for the UsageError of an unknown name.
+    """
     if spec in known:  # a name may itself hold a comma
-        return (known[spec],)
-    names = dict.fromkeys(filter(None, map(str.strip, spec.split(",")))) or {spec: None}
+        return [spec]
+    words = [*filter(None, map(str.strip, spec.split(",")))] or [spec]
+    names = dict.fromkeys(word if word in known else without_suffix(word) for word in words)
     for name in (name for name in names if name not in known):
         close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else list(known)
-        raise UsageError(option, f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")
-    return tuple(known[name] for name in names)
+        raise UsageError(option, f"there is no view {name!r}; {takes} such as {listing(close, 3)}")
+    return [*names]

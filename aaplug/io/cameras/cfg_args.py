@@ -1,7 +1,7 @@
 """The settings of an INRIA training run: `cfg_args`, the text of a Python `Namespace(...)`.
 
 The text comes with downloaded scenes, so it is parsed and never evaluated: one call of `Namespace` whose keywords are
-literals.  `source_path` names a folder of another machine and is not read.
+literals.  `source_path` names a folder, maybe of another machine: it is told, and nothing in it is read.
 
 Functions raise FormatError for a file that breaks its format.
 """
@@ -27,13 +27,14 @@ class CfgArgs:
     """A run's settings that concern its images.
 
     resolution: a divisor in DIVISORS, CAPPED, or a width in px.
-    images: the folder of the photos.
+    images: the folder of the photos, in the data set `source`, which is empty if the file does not say.
     white_background: None if the file does not say.
     held_out: true if every 8th view was kept from training (eval).
     """
 
     resolution: float = CAPPED
     images: str = "images"
+    source: str = ""
     white_background: bool | None = None
     held_out: bool = False
 
@@ -76,4 +77,5 @@ def read_cfg_args(path: Path) -> CfgArgs:
     white, held_out = (settings.get(field) for field in ("white_background", "eval"))
     for field, value in (("white_background", white), ("eval", held_out)):
         entry.place.expect(value is None or isinstance(value, bool), field, "True or False", value)
-    return CfgArgs(resolution, entry.get("images", text, CfgArgs.images), white, bool(held_out))
+    images, source = entry.get("images", text, CfgArgs.images), settings.get("source_path")
+    return CfgArgs(resolution, images, source if isinstance(source, str) else "", white, bool(held_out))

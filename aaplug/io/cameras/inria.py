@@ -50,7 +50,12 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     sizes, why = _training_sizes(source, settings, options)
     split = _split(sets.trained_at(source, sizes), settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
-    return sets.camera_set("INRIA cameras.json", source, split, why, background)
+    more = []
+    if settings and settings.source and not any(camera.photo for camera in source):
+        more = [
+            f"photos: none found; training had them in {settings.source}/{settings.images}; `images` names a folder"
+        ]
+    return sets.camera_set("INRIA cameras.json", source, split, why, background, more)
 
 
 class Model:

@@ -49,7 +49,8 @@ class PhotoFolder:
         except (OSError, RuntimeError):  # a loop of links
             inside = False
         if not inside:
-            hint = "pass `images` to allow another folder, or copy it where a link leads there"
+            other = "" if self.folder == self.home else "pass `images` to allow another folder, or "
+            hint = f"{other}where a link leads there, copy it, or link the whole data set"
             raise place.error(f"photo {name!r} lies outside {self.home}; {hint}")
         return photo
 
