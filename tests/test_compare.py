@@ -275,6 +275,7 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     assert len(rows) == 2 * 3 * 3  # scenes, scales, views
     assert {row["compared scene"] for row in rows} == {"scene.ply", "dim.ply"}
     page = Path("out/report.html").read_text()
+    assert "aaplug comparison" in page
     assert "against the first scene" in page
     assert "differences of the Gaussians" in page
     assert "compared scene" in page

@@ -6,7 +6,7 @@ from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
 from aaplug.system.errors import FormatError, OutputError, UsageError
 
-REQUEST = {"views": 3, "scales": [1.0, 0.1]}
+REQUEST = {"views": 3, "scales": [1.0, 0.1], "versions": {"aaplug": "1", "torch": "2"}}
 
 
 def measured(view: str) -> Measurement:
@@ -42,8 +42,8 @@ def test_a_torn_line_is_forgotten_and_written_again(path, end, views):
 
 
 def test_another_request_is_refused_by_what_changed(path):
-    with pytest.raises(UsageError, match=r"another request \(scales changed"):
-        Journal(path, REQUEST | {"scales": [1.0]}, resume=True)
+    with pytest.raises(UsageError, match=r"another request \(scales, versions.torch changed"):
+        Journal(path, {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}, resume=True)
 
 
 def test_without_resume_it_starts_anew(path):

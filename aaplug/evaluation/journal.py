@@ -109,9 +109,19 @@ class Journal:
 
 def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Refuse to continue what was asked for otherwise; path: where that is written."""
-    if changed := dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key)):
+    if changed := [*_changes(before, now)]:
         how = "repeat that request, or start again with `overwrite`, not `resume`"
-        raise UsageError(str(path), f"is of another request ({listing(list(changed))} changed since); {how}")
+        raise UsageError(str(path), f"is of another request ({listing(changed)} changed since); {how}")
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """The keys whose values differ; those of mappings with that of the mapping, such as `versions.torch`."""
+    for key in dict.fromkeys((*now, *before)):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from (f"{key}.{inner}" for inner in _changes(old, new))
+        elif old != new:
+            yield key
 
 
 def _measurement(line: Any) -> Measurement:

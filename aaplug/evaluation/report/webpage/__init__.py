@@ -45,6 +45,7 @@ def page(
         ("page.css",),
         ("page.js",),
         name=name,
+        kind="comparison" if facts else "evaluation",
         report=report,
         protocol=dict(report.protocol),
         scales=[scale_name(scale) for scale in report.scales],
