@@ -98,6 +98,7 @@ def set_up() -> None:
             stream.reconfigure(errors="backslashreplace")
     logger = logging.getLogger("aaplug")
     logger.handlers, logger.propagate = [_Warnings()], False
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its folder for fonts is no matter of the user's
 
 
 def refuse(problem: str) -> None:

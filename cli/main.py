@@ -7,11 +7,11 @@ import errno
 import gc
 import json
 import os
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
-from shutil import get_terminal_size
 from textwrap import fill
 from typing import TextIO
 
@@ -26,6 +26,7 @@ DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting sc
   aaplug render scene.ply --cameras path/to/colmap --scale 0.25 -o images
   aaplug convert scene.ply --cameras path/to/colmap -o converted.ply
   aaplug VERB --help"""
+PLOTS_FOLDER = "MPLCONFIGDIR"  # of the environment; matplotlib sets it to a temporary folder if home is read-only
 UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 
 
@@ -54,9 +55,13 @@ def program() -> None:
     keep_freed_memory()
     end_as_by_interrupt()
     gc.set_threshold(GARBAGE)
+    given = os.environ.get(PLOTS_FOLDER)
     try:
         main()
     except SystemExit as end:
+        made = os.environ.get(PLOTS_FOLDER)
+        if made and made != given:
+            shutil.rmtree(made, ignore_errors=True)
         with suppress(OSError):  # its reader has gone
             sys.stdout.flush()
             sys.stderr.flush()
@@ -140,7 +145,7 @@ def show_verbs() -> None:
     from .verbs import VERBS
 
     print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n")
-    columns, longest = get_terminal_size().columns, max(map(len, VERBS))
+    columns, longest = shutil.get_terminal_size().columns, max(map(len, VERBS))
     for name, command in VERBS.items():
         first = command.help.partition("\n\n")[0]
         print(fill(f"  {name:{longest}}  {first}", columns, subsequent_indent=" " * (longest + 4)))

@@ -1,6 +1,7 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -232,6 +233,15 @@ def test_a_stream_that_the_caller_closed_is_written_nowhere(closed, words, code)
     program = f"import os; os.close({closed}); os.execv({sys.executable!r}, ['python', '-c', {START!r}, {words!r}])"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (run.returncode, "Traceback" in run.stderr, bool(run.stdout)) == (code, False, (closed, code) == (2, 0))
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_folder_that_matplotlib_makes_where_home_is_read_only_goes(tmp_path, given):
+    change = f"main.main = lambda: (os.environ.update(MPLCONFIGDIR={str(tmp_path)!r}), sys.exit())"
+    program = f"import os, sys; from aaplug_cli import main; {change}; main.program()"
+    environment = os.environ | ({"MPLCONFIGDIR": str(tmp_path)} if given else {})
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+    assert tmp_path.exists() == given
 
 
 @pytest.mark.parametrize(("words", "code"), [(["info", "scene.ply", "--json"], 0), (["info", "none.ply"], 2)])

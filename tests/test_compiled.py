@@ -464,9 +464,11 @@ def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cach
 @pytest.mark.parametrize("compiler", [True, False])
 def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, compiler):
     monkeypatch.setattr(choice, "has_compiler", lambda: compiler)
+    monkeypatch.setenv("AAPLUG_KERNELS", "/nowhere")
     said: list[str] = []
     assert find_rasterizer("auto", 1, said.append) is RASTERIZERS["eager"]
     assert len(said) == 1
+    assert "AAPLUG_KERNELS names /nowhere, which has no kernels" in said[0]
     assert ("warmup" if compiler else "no C++ compiler") in said[0]
 
 

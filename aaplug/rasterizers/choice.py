@@ -1,12 +1,13 @@
 """Finding the rasterizer that a user means."""
 
+import os
 from collections.abc import Callable
 
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, build, has_compiler, is_built, load
+from aaplug.rasterizers.tiled.ahead_of_time import BUNDLE_VARIABLE, KERNELS, build, has_compiler, is_built, load
 from aaplug.rasterizers.tiled.on_demand import OnDemandKernels
 from aaplug.system.errors import UsageError, not_one_of
 
@@ -58,5 +59,8 @@ def find_rasterizer(
         say("rasterizer: compiled")
         return Tiled(kernels)
     hint = "`aaplug warmup` compiles it, several times as fast"
-    say(f"rasterizer: eager ({hint if has_compiler() else 'no C++ compiler found to compile it'})")
+    hint = hint if has_compiler() else "no C++ compiler found to compile it"
+    if bundle := os.environ.get(BUNDLE_VARIABLE):
+        hint = f"{BUNDLE_VARIABLE} names {bundle}, which has no kernels for this torch and processor; {hint}"
+    say(f"rasterizer: eager ({hint})")
     return RASTERIZERS["eager"]
