@@ -239,6 +239,8 @@ def compare(words: Words) -> Answer:
     paths = [*words.scenes] if first is None else [first, *(path for path in words.scenes if path != first)]
     if len(paths) < 2:
         raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
+    if words.fail_under is not None and "psnr" not in map(str.lower, words.metric):
+        raise UsageError("fail_under", "is of PSNR, which `metric` leaves out")
     from aaplug.verbs.compare import check_compared
 
     check_compared(words.output, words.resume, words.overwrite)  # before anything is read

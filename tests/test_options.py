@@ -107,6 +107,7 @@ REFUSED = {
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
     "compare a.ply b.ply --fail-under 500": "--fail-under: takes 0..200, got 500",
+    "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
     "bench --gaussians 1e5": "takes 1..100000000 ..., got 1e5",
     "bench --gaussians 10 --resolution 0x0": "--resolution: takes sizes such as 400x400, got 0x0",
     "bench --gaussians 10 --resolution 1000000x1000000": "the limit is 16384 a side",
