@@ -106,6 +106,7 @@ REFUSED = {
     "render s.ply -o out --threads 99999": "--threads: takes 1..",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
+    "evaluate s.ply -o out --show 5": "--show: selects views of the report; give --report, too",
     "compare a.ply b.ply --fail-under 500": "--fail-under: takes 0..200, got 500",
     "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
     "bench --gaussians 1e5": "takes 1..100000000 ..., got 1e5",

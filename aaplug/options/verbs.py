@@ -138,6 +138,11 @@ class EvaluateOptions(RecipeOptions):
     overwrite: bool = False
     """Replace existing results."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.show != EvaluateOptions.show and not self.report:
+            raise UsageError("show", "selects views of the report; give `report`, too")
+
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(RecipeOptions):
