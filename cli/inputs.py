@@ -98,10 +98,14 @@ def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
     how, orbit = words.keywords(CameraOptions), words.of(Orbit)
     path = how.pop("cameras") or scene.camera_folder
     if path is None:
+        given, usual, problem = how, CameraOptions(), "is of cameras, and there are none; name them with `cameras`"
+    else:
+        given, usual, problem = vars(orbit), Orbit(), f"is for scenes without cameras, and there are some: {path}"
+    for name, value in given.items():
+        if name != "monitor" and value != getattr(usual, name):
+            raise UsageError(name, problem)
+    if path is None:
         return orbit
-    for name, usual in vars(Orbit()).items():
-        if name != "monitor" and getattr(orbit, name) != usual:
-            raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
     cameras = aaplug.read_cameras(path, **how)
     for note in cameras.notes:
         say(worded(f"cameras: {note}", options_of(CameraOptions)))

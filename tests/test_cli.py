@@ -131,6 +131,8 @@ REFUSED = {
     f"{BARE} --train-view 40x40 --train-rate 5": ["--train-view: and --train-rate"],
     f"{BARE} --train-rate 1e8": ["the limit is 16384 a side"],
     f"{BARE} --cameras . --orbit 4": ["--orbit: is for scenes without cameras"],
+    f"{BARE} --test-every 4": ["--test-every: is of cameras, and there are none; name them with --cameras"],
+    f"{BARE} --iteration 7": ["--iteration: is of a model folder, and scene.ply is a file"],
     f"{VIDEO} --recipe multi-scale": ["base_mask"],
     "video scene.ply --cameras . -o new.gif": ["new.gif", ".webm"],
     f"{VIDEO} --seconds 0": ["--seconds"],

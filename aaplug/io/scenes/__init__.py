@@ -255,10 +255,12 @@ def find_scene(path: AnyPath, iteration: int | None = None) -> Path:
 
     A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images or chunks,
     the finest of its levels of detail, the first of its frames, or an index of levels for another viewer.
-    Raises FormatError if the folder holds no scene, or not that iteration.
+    Raises FormatError if the folder holds no scene, or not that iteration, and UsageError for an iteration of a file.
     """
     path = Path(path)
     if not path.is_dir():
+        if iteration is not None and path.exists():
+            raise UsageError("iteration", f"is of a model folder, and {path} is a file")
         return path
     if is_pyramid(path):
         return path_of(path, read_manifest(path).levels[0])
