@@ -245,6 +245,7 @@ for i, work in enumerate(works, 1):
     if i < len(works) and os.fork():
         assert os.wait()[1] == 0
         continue
+    {warm}
     open("/proc/self/clear_refs", "w").write("5")  # resets the peak, which imports raised
     before = peak()
     exec(work)
@@ -253,12 +254,13 @@ for i, work in enumerate(works, 1):
 """
 
 
-def memory_taken(prepare: str, *works: str) -> list[int]:
+def memory_taken(prepare: str, *works: str, warm: str = "pass") -> list[int]:
     """Bytes by which each of the statements raises the peak of a fresh process, or of a copy of it.
 
-    A process that ran others has memory to reuse.  A copy, of which all but the last are, also counts the code it runs.
+    A process that ran others has memory to reuse.  A copy, of which all but the last are, also counts the code it runs,
+    which differs between builds of torch, but for what the statement `warm` ran before.
     """
-    return [*map(int, run_python(MEASURE.format(prepare=prepare, works=works)).stdout.split())]
+    return [*map(int, run_python(MEASURE.format(prepare=prepare, works=works, warm=warm)).stdout.split())]
 
 
 def straight_camera(

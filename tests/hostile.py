@@ -146,9 +146,11 @@ def _work(target: Target, files: list[bytes], send) -> None:
     space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (space + MEMORY, space + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    before, outcomes, slowest = _resident(), Counter[str](), 0.0
+    outcomes, slowest = Counter[str](), 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = target.make(Path(folder))
+        outcome(path, target.read)  # reads the code, too, which counts as memory of a fork
+        before = _resident()
         there = sorted(p.name for p in path.parent.iterdir())
         for data in files:
             path.write_bytes(data)
