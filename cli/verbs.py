@@ -452,9 +452,9 @@ def bench(words: Words) -> Answer:
     if words.scene is not None or words.model_path is not None:
         scene, cameras = read_inputs(words)
     runs, exponents = aaplug.bench(scene, cameras, **told(words, verbs.BenchOptions))
-    import torch
+    from aaplug.system.executors import given_threads
 
-    threads = words.threads or torch.get_num_threads()
+    threads = words.threads or given_threads()
     headings = ("Gaussians", "px, by")
     sizes = [(f"{run.gaussians:,}", f"{run.width}x{run.height} {run.rasterizer}") for run in runs]
     figures = [(*size, *(text(run) for text in FIGURES.values())) for size, run in zip(sizes, runs, strict=True)]

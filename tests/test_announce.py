@@ -17,6 +17,7 @@ from aaplug.rendering.assumed import CROP_SAMPLES
 from aaplug.rendering.cost import EAGER, GRADIENTS, cost_of
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import SAMPLE_BYTES, Drawing, Renderer
+from aaplug.system import groups
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.bench import bench
@@ -86,7 +87,7 @@ def test_a_step_is_estimated_with_its_anchor_and_its_truths(renderer):
 
 @pytest.fixture
 def machine_alone(monkeypatch, tmp_path):
-    monkeypatch.setattr(limits, "CONTROL_GROUPS", tmp_path / "none")
+    monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "none")
 
 
 def test_what_the_machine_cannot_hold_is_refused(renderer, machine_alone, monkeypatch):
@@ -149,7 +150,7 @@ def test_an_image_that_memory_does_not_hold_is_refused_from_python_too(renderer,
 
 
 @pytest.mark.parametrize(
-    ("groups", "file"),
+    ("lines", "file"),
     [
         ("0::/job/step\n", "memory.max"),
         ("0::/job/step\n", "job/memory.max"),
@@ -157,14 +158,14 @@ def test_an_image_that_memory_does_not_hold_is_refused_from_python_too(renderer,
         ("4:hugetlb,memory:/docker/1\n", "memory/docker/1/memory.limit_in_bytes"),
     ],
 )
-def test_the_limit_of_a_container_counts(groups, file, monkeypatch, tmp_path):
+def test_the_limit_of_a_container_counts(lines, file, monkeypatch, tmp_path):
     root = tmp_path / "cgroup"
     (root / file).parent.mkdir(parents=True)
     (root / file).write_text("1000000000\n")
-    (tmp_path / "groups").write_text(groups)
+    (tmp_path / "groups").write_text(lines)
     (root / "memory.high").write_text("5\n")
-    monkeypatch.setattr(limits, "CGROUP", root)
-    monkeypatch.setattr(limits, "CONTROL_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(groups, "ROOT", root)
+    monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "groups")
     assert limits.lack_of_memory(4e8) is None
     assert limits.lack_of_memory(6e8) == "0.6 GB, more than 50% of this container's 1.0 GB"
 
@@ -173,8 +174,8 @@ def test_a_container_without_a_limit_leaves_the_machines(machine_alone, monkeypa
     machine = limits.usable_memory()
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "groups").write_text("0::/\n")
-    monkeypatch.setattr(limits, "CGROUP", tmp_path)
-    monkeypatch.setattr(limits, "CONTROL_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(groups, "ROOT", tmp_path)
+    monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "groups")
     assert limits.usable_memory() == machine
 
 

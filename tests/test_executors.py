@@ -17,6 +17,7 @@ import torch
 import aaplug
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.rasterizers.tiled import Tiled
+from aaplug.system import groups
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, given_threads, torch_threads
@@ -133,6 +134,30 @@ def test_threads_leave_a_core_to_another_program(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("aaplug.system.cores.WINDOW_SECONDS", -math.inf)
     cores = FreeCores()
     assert [cores.count() for _ in range(3)] == [1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("lines", "files", "expected"),
+    [
+        ("0::/job\n", {"job/cpu.max": "150000 100000\n", "cpu.max": "max 100000\n"}, 2),
+        ("0::/job\n", {"job/cpu.max": "max 100000\n", "cpu.max": "300000 100000\n"}, 3),
+        ("1:cpu,cpuacct:/\n", {"cpu/cpu.cfs_quota_us": "50000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 1),
+        ("1:cpu:/\n0::/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+        ("4:memory:/\n", {"cpu.max": "100000 100000\n"}, 8),
+    ],
+)
+def test_threads_are_as_many_as_a_container_may_use(lines, files, expected, monkeypatch, tmp_path):
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(content)
+    (tmp_path / "groups").write_text(lines)
+    monkeypatch.setattr(groups, "ROOT", tmp_path)
+    monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(groups, "quota", groups.quota.__wrapped__)
+    monkeypatch.setattr(Reading, "now", lambda: None)
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    assert FreeCores().count() == given_threads() == expected
 
 
 @pytest.mark.skipif(Reading.now() is None, reason="the system does not tell how busy its cores are")

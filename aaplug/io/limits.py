@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from aaplug.system import groups
 from aaplug.system.errors import UsageError
 
-CGROUP = Path("/sys/fs/cgroup")
-CONTROL_GROUPS = Path("/proc/self/cgroup")  # those of this process
 STATM = Path("/proc/self/statm")  # pages of memory that it uses
 
 
@@ -90,15 +89,9 @@ def usable_memory() -> Memory | None:
     with suppress(AttributeError, ValueError, OSError):
         machine = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
         candidates.append(Memory(machine, "this machine's {}"))
-    for line in CONTROL_GROUPS.read_text().splitlines() if CONTROL_GROUPS.exists() else []:
-        _, controllers, place = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):  # of version 2 or 1 of Linux's control groups
-            root, name = (CGROUP / "memory", "memory.limit_in_bytes") if controllers else (CGROUP, "memory.max")
-            inner = root / place.lstrip("/")
-            for folder in (inner, *inner.parents):  # those above limit it too
-                with suppress(OSError, ValueError):  # "max", or it is not there
-                    if folder.is_relative_to(root):
-                        candidates.append(Memory(float((folder / name).read_text()), "this container's {}"))
+    for [most] in groups.limits("memory", ["memory.max"], ["memory.limit_in_bytes"]):
+        if most >= 0:
+            candidates.append(Memory(most, "this container's {}"))
     with suppress(ImportError, OSError):
         import resource
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from aaplug.system import groups
 from aaplug.system.executors import given_threads, torch_threads
 
 STATISTICS = Path("/proc/stat")  # Linux: clock ticks that each core spent in each state
@@ -41,7 +42,7 @@ class Reading:
 
 
 class FreeCores:
-    """Counts the cores of this process that no other program uses."""
+    """Counts the cores of this process that no other program uses, within its container's quota."""
 
     def __init__(self):
         self._before, self._others = Reading.now(), 0.0
@@ -54,7 +55,8 @@ class FreeCores:
             if now is not None:
                 work = (now.cores - before.cores) - (now.own - before.own)
                 self._others = max(0.0, work / (now.clock - before.clock))
-        return max(1, round(len(os.sched_getaffinity(0)) - self._others)) if before else os.cpu_count() or 1
+        free = round(len(os.sched_getaffinity(0)) - self._others) if before else os.cpu_count() or 1
+        return max(1, min(free, groups.quota()))
 
 
 FREE_CORES = FreeCores()

@@ -23,6 +23,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
+from aaplug.system import groups
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import OutputError, UsageError, of_system, reason
 from aaplug.system.locks import scratch
@@ -149,7 +150,7 @@ if hasattr(os, "register_at_fork"):
 
 def given_threads() -> int:
     """The number of threads that torch may use, of which it uses fewer inside `cores.on_free_cores`."""
-    return _given.threads or torch.get_num_threads()
+    return _given.threads or min(torch.get_num_threads(), groups.quota())
 
 
 @contextmanager
