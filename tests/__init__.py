@@ -37,12 +37,13 @@ def with_checks(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with its checks: jaxtyping's own, which does nothing else."""
     from beartype import beartype
 
-    check, test, left = beartype(function), 0, CHECKS_OF_EACH
+    check, test, left = None, 0, CHECKS_OF_EACH
 
     @wraps(function)
     def call(*args: Any, **options: Any) -> Any:
         global _left
-        nonlocal test, left
+        nonlocal check, test, left
+        check = check or beartype(function)  # at the first call: most functions are called by few tests
         if test != _test:
             test, left = _test, CHECKS_OF_EACH
         left, _left = left - 1, _left - 1
