@@ -5,15 +5,20 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from jaxtyping import Float
+from torch import Tensor
+
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
 from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import JOURNAL
-from aaplug.evaluation.metrics import find_metrics
-from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, sheet_of, write_page, write_texts
+from aaplug.evaluation.metric import TimedRenderer
+from aaplug.evaluation.metrics import PSNR, find_metrics
+from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import as_csv
-from aaplug.evaluation.truth import Truth
+from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.io.atomic import AnyPath
 from aaplug.io.images import write_png
 from aaplug.io.scenes import scene_of
@@ -93,7 +98,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             files = write_texts(folder, texts, replaces)
             title = f"{rows[0].name} and {', '.join(scene.name for scene in rows[1:])}"
             files += write_page(folder, title, report, bounds, images, replaces, comparison.facts())
-            write_png(folder / sheet, sheet_of(comparison, task), overwrite=replaces)
+            write_png(folder / sheet, _sheet(comparison, task), overwrite=replaces)
             for file in [*files, folder / sheet]:
                 say(f"wrote {file}")
     return comparison
@@ -124,3 +129,19 @@ def _named(scenes: ScenesLike) -> dict[str, Scene]:
     again = [place > 0 and file is not None and file == files[0] for place, file in enumerate(files)]
     names = [name + " again" * same for name, same in zip(names, again, strict=True)]
     return dict(zip(file_names(names, "scene", 1), opened, strict=True))
+
+
+def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
+    """The view with the lowest PSNR at every scale: the truth, then every other scene and the map of its errors."""
+    reference, report = comparison.reference.name, comparison.report
+    values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
+    defined = [(value, view) for value, view in values if value is not None]
+    worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
+    truth = ViewTruth(task.truth, task.views[worst])
+    others = {c.name: TimedRenderer(c.renderer) for c in task.candidates if c.name != reference}
+    rows = []
+    for scale in sorted(task.scales, reverse=True):
+        expected = truth.image(scale)
+        assert expected is not None
+        rows.append((scale, [expected, *(renderer(truth.camera(scale)).rgb for renderer in others.values())]))
+    return contact_sheet((reference, *others), rows, errors=True)

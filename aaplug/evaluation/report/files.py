@@ -12,19 +12,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
-
-from aaplug.evaluation.comparison import Comparison
 from aaplug.evaluation.coverage import Coverage
-from aaplug.evaluation.engine import Task
 from aaplug.evaluation.image_store import RENDERS, REPORT_FOLDER, TEST_FOLDER, TRUTHS, ImageStore
 from aaplug.evaluation.journal import JOURNAL
-from aaplug.evaluation.metric import TimedRenderer
-from aaplug.evaluation.metrics import PSNR
-from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import CEILING, Facts, Report, method
-from aaplug.evaluation.truth import ViewTruth
 from aaplug.io.atomic import make_folder, refuse_inputs, replacing
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
@@ -95,19 +86,3 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
 def as_json(data: Any) -> str:
     """Strict JSON, as files hold it."""
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
-
-
-def sheet_of(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
-    """The view with the lowest PSNR at every scale: the truth, then every other scene and the map of its errors."""
-    reference, report = comparison.reference.name, comparison.report
-    values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
-    defined = [(value, view) for value, view in values if value is not None]
-    worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
-    truth = ViewTruth(task.truth, task.views[worst])
-    others = {c.name: TimedRenderer(c.renderer) for c in task.candidates if c.name != reference}
-    rows = []
-    for scale in sorted(task.scales, reverse=True):
-        expected = truth.image(scale)
-        assert expected is not None
-        rows.append((scale, [expected, *(renderer(truth.camera(scale)).rgb for renderer in others.values())]))
-    return contact_sheet((reference, *others), rows, errors=True)
