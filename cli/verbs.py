@@ -81,7 +81,7 @@ def render(words: Words) -> Answer:
 def convert(words: Words) -> Answer:
     """Fuse anti-aliasing into a plain scene file of as many Gaussians, for viewers with a fixed 2D filter.
 
-    In seconds for the 2D Mip filter (0.1 px², compensated), in minutes for a viewer named by --for.  For fewer
+    It takes seconds for the 2D Mip filter (0.1 px², compensated), and minutes for a viewer named by --for.  For fewer
     Gaussians, use lod; to move the Gaussians until all sizes look right, finetune.
     """
     if words.batch is not None:
@@ -320,8 +320,8 @@ def _limits() -> Answer:
         "LOG_SCALE": (MAX_LOG_SCALE, "", "a log-scale's absolute value, clamped on use"),
         "RENDER_SIDE": (MAX_SIDE, "px", "a side of a rendered image"),
     }
-    rows = [(n, f"{value:,}", LIMITS[n].unit, LIMITS[n].what, f"AAPLUG_{n}") for n, value in values.items()]
-    rows += [(name, f"{value:,}", unit, what, "fixed") for name, (value, unit, what) in fixed.items()]
+    rows = [(n, f"{value:,.12g}", LIMITS[n].unit, LIMITS[n].what, f"AAPLUG_{n}") for n, value in values.items()]
+    rows += [(name, f"{value:,.12g}", unit, what, "fixed") for name, (value, unit, what) in fixed.items()]
     shown = [table(rows, ("limit", "value", "unit", "of", "set by"))]
     if (memory := usable_memory()) is not None:
         shown.append(f"Memory: {memory}.")

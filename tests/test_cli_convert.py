@@ -120,7 +120,8 @@ def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
 def test_a_file_fits_the_viewer_or_names_one_that_opens_it(cli):
     means = read_scene("scene.ply").gaussians().means
     for viewer, axes in (("spark", "opencv"), ("spark --spz-axes opengl", "opengl"), ("mip", "opengl")):
-        cli.done(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")
+        _, err = cli.done(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")
+        assert ("is known to open this .spz; --for spark-mip" in err) == (viewer == "mip")
         assert torch.allclose(read_scene("c.spz", spz_axes=axes).gaussians().means, means, atol=1e-5)
     _, err = cli.done("convert scene.ply --cameras . -o c.splat")
     assert "open the .splat in Spark 2.2.0 (blurAmount: 0.1) or GaussianSplats3D 0.4.7 (antialiased: true" in err

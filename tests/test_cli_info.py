@@ -90,4 +90,5 @@ def test_few_gaussians_may_all_have_values_of_activated_ones(tmp_path: Path, col
 def test_limits_are_printed(cli, monkeypatch):
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "123")
     assert json.loads(cli("info --limits --json")[1])["GAUSSIANS"] == 123
-    assert "AAPLUG_INFLATE" in cli("info --limits")[1]
+    assert "AAPLUG_INFLATE" in (shown := cli("info --limits")[1])
+    assert "123 " in shown

@@ -262,3 +262,6 @@ def test_every_option_in_the_documents_exists():
     # of 3DGS's own scripts, of splat-transform, of nerfbaselines, of Dask
     others = {"--antialiasing", "--decimate", "--decimate-adaptive", "--set", "--memory-limit"}
     assert named - known - others == set()
+    for verb, words in re.findall(r"(?<!`)`aaplug ([a-z-]+)\s([^`]+)`", text):
+        flags = {flag for option in VERBS[verb].options.values() for flag in option.flags}
+        assert set(re.findall(r"(?<!\S)--[a-z][a-z-]+", words)) <= flags, f"aaplug {verb} {words}"

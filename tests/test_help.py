@@ -102,7 +102,7 @@ def test_a_guide_is_drawn_on_a_terminal_and_long_words_keep_their_ends(cli, monk
 def test_texts_name_guides_that_are_there_and_not_their_files():
     sources = [*(ROOT / "aaplug").rglob("*.py"), *(ROOT / "cli").glob("*.py"), ROOT / "README.md", *GUIDES]
     named = re.findall(r"`aaplug guide (\w+)`", "".join(path.read_text() for path in sources))
-    assert {"cluster", "methods", "viewers"} <= set(named) <= {path.stem for path in GUIDES}
+    assert {"cluster", "formats", "viewers"} <= set(named) <= {path.stem for path in GUIDES}
 
 
 def test_the_table_of_recipes_has_every_one_and_marks_those_for_comparison(cli, monkeypatch):

@@ -142,7 +142,7 @@ class ImageOptions(Options):
     """Images by one recipe at one size."""
 
     recipe: OneRecipe = "auto"
-    """How to render; `aaplug evaluate --recipe all` lists further recipes, for comparison."""
+    """How to render; `aaplug recipes` lists them all."""
     scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size (default: 1)."""
     resolution: Annotated[str | None, Text(metavar="WxH", parsed=partial(size_of, shape=(1, 1)))] = None

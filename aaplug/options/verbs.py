@@ -116,7 +116,7 @@ class EvaluateOptions(RecipeOptions):
     recipe: Annotated[
         str | Sequence[str | Recipe], names(ALL, kind="recipe", metavar=f"{ALL}|{RECIPE_METAVAR} ...", count=None)
     ] = ("classic", "mip", "matched", "auto")
-    """One or more recipes.  all adds those for comparison, which `aaplug guide methods` lists."""
+    """One or more of `aaplug recipes`; all takes every one that the scene suits."""
     scale: Annotated[Sequence[float] | None, SCALES] = None
     """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Source = "auto"
@@ -235,7 +235,7 @@ class LodOptions(WritingOptions, ViewOptions):
     page: Annotated[AnyPath | None, flag("NODE_MODULES", read=Path)] = None
     """With --to: add a page that opens the result, and the viewer's program from this folder of npm packages."""
     refine: bool = True
-    """Merge alone: do not tune the result to look like the scene, which takes minutes."""
+    """Merge alone, without the tuning, which takes minutes."""
     steps: Annotated[int | None, STEPS] = None
     """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
     resume: bool = False

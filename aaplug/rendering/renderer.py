@@ -122,7 +122,7 @@ class Renderer:
                 `cull_margin` and `min_seen` are ignored.
             recipe: a recipe, or its name in `RECIPES`.
             quality: "fast", "balanced" or "best": how finely recipe "auto" supersamples.
-            background: a colour, "white", "black", or "auto": the colour that a `CameraSet` records, else black.
+            background: a colour, in numbers or as CSS writes it, or "auto": that of the `CameraSet`, else black.
             rasterizer: a rasterizer, or its name: "auto" is "compiled" where `aaplug warmup` has run, else "eager".
             cull_margin: see `TrainingViews`.
             min_seen: share of the Gaussians that the cameras must see.

@@ -37,7 +37,7 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
     The file is read in parts, so it can be larger than memory.
 
     Args:
-        scene: a scene's file or a model folder.
+        scene: see `render`.
         cameras: training cameras, their file or folder, to tell also how finely they sample the scene; None for those
             of its model folder.  Where it has none, or for an `Orbit`: what can be told without, under its assumption.
 

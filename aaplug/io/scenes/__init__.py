@@ -128,7 +128,7 @@ def read_scene(
     Its Gaussians are read when they are first asked for: `read_scene("scene.ply").gaussians()`.
 
     Args:
-        path: see `find_scene`.
+        path: of the file or folder; of a folder of several kinds a model's last iteration comes first.
         iteration: which iteration of a model folder; None for the last.
         convention: how the scene was trained, if the file does not say or is wrong.
         drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number;
@@ -140,6 +140,7 @@ def read_scene(
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
+        UsageError: `iteration` is given for a file.
     """
     options = SceneFileOptions(allow_checkpoint, spz_axes)
     with library_errors(Path(path)):
