@@ -122,7 +122,7 @@ def test_an_orientation_tag_moves_no_pixel(tmp_path: Path):
     assert (got[:, :12] > 0.9).all()
 
 
-@pytest.mark.parametrize("mode", ["CMYK", "LA", "F"])
+@pytest.mark.parametrize("mode", ["CMYK", "LA", "RGBA", "F"])
 def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str):
     Image.new(mode, (4, 4)).save(tmp_path / "a.tiff")
     with pytest.raises(FormatError, match="save it"):

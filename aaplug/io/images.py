@@ -40,6 +40,8 @@ ROWS_PER_BAND = 64  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
 MAX_PIXEL_SIZE = 8  # bytes: four channels of 16 bits
+TIFF_ALPHA = 338  # tag ExtraSamples
+PREMULTIPLIED, STRAIGHT = 1, 2  # its values
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHUNK = struct.Struct(">I4s")  # length of the data and kind, before them
 PNG_CHECKSUM = 4  # bytes, after them
@@ -132,12 +134,16 @@ def encoded(suffix: str, image: Float[Tensor, "h w c"], quality: int | None = No
     return file.tobytes()
 
 
-def _look(path: Path) -> tuple[tuple[int, int], bool]:
-    """Width and height in px, and whether it is transparent, as a file within the limits declares before its pixels."""
+def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
+    """Width and height in px, whether it is transparent, and a TIFF's kind of alpha, of a file within the limits.
+
+    The file declares them before its pixels.
+    """
     pillow_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it is lower than ours and only warns
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
             size, transparent = header.size, header.has_transparency_data
+            alpha = getattr(header, "tag_v2", {}).get(TIFF_ALPHA, (0,))[-1]
             stored = path.stat().st_size
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
@@ -150,13 +156,13 @@ def _look(path: Path) -> tuple[tuple[int, int], bool]:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
     if stored > MAX_PIXEL_SIZE * pixels + whole_limit("IMAGE_EXTRA"):
         raise FormatError(path, f"has {stored:,} bytes, which {size[0]}x{size[1]} px do not need")
-    return size, transparent
+    return size, transparent, alpha
 
 
 @torch_threads(1)
 def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
     """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
-    size, transparent = _look(path)
+    size, transparent, alpha = _look(path)
     try:
         data = _still(path, path.read_bytes())
         with captured_stderr() as words:
@@ -175,7 +181,8 @@ def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Fl
         raise FormatError(path, f"has {width}x{height} px where its header says {size[0]}x{size[1]}")
     if samples.dtype not in SAMPLE_TYPES.values():
         raise FormatError(path, f"holds {samples.dtype} samples; save it with 8 or 16 bits")
-    if transparent != (stored == [ALPHA_CHANNELS]):
+    multiplied = alpha == PREMULTIPLIED or (alpha == STRAIGHT and samples.dtype == np.uint8)  # OpenCV does so itself
+    if transparent != (stored == [ALPHA_CHANNELS]) or multiplied:
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
     samples = samples.reshape(height, width, -1)
     order = [0, 0, 0] if samples.shape[2] == 1 else [2, 1, 0, 3][: samples.shape[2]]  # from BGR(A) or gray
