@@ -17,6 +17,7 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
+from aaplug.io.cameras.photos import without_suffix
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
@@ -102,6 +103,16 @@ def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
     with_photo, without = read_cameras(tmp_path).train
     assert (with_photo.width, with_photo.photo) == (100, tmp_path / "images_4" / "a.JPG")
     assert (without.width, without.photo) == (100, None)
+
+
+def test_names_of_inria_lose_a_suffix_that_tells_no_views_apart(tmp_path):
+    photo(tmp_path / "images" / "c" / "a.JPG", 400, 200)
+    views = [inria_entry("c/a.JPG"), inria_entry("b", position=[0.0, 0, 0])]
+    cameras = read_cameras(inria(tmp_path, *views, cfg="Namespace()"))
+    assert names(cameras.train) == ["b", "c/a"]
+    assert cameras.train[1].photo == tmp_path / "images" / "c" / "a.JPG"
+    views = [inria_entry("a.png"), inria_entry("a.jpg")]
+    assert names(read_cameras(inria(tmp_path, *views)).train) == ["a.jpg", "a.png"]
 
 
 def test_photo_of_another_shape_is_refused(tmp_path):
@@ -492,6 +503,50 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("lens", "focals"),
+    [
+        ({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 2}, (20, 10)),
+        ({"camera_angle_x": math.pi / 2}, (20, 20)),
+        ({"camera_angle_y": math.pi / 2}, (10, 10)),
+        ({"camera_angle_x": 1.0, "camera_angle_y": math.pi / 2, "fl_x": 30}, (30, 10)),
+        ({"camera_angle_x": 1.0, "camera_angle_y": 1.0, "fl_x": 30, "fl_y": 31}, (30, 31)),
+    ],
+    ids=str,
+)
+def test_each_axis_of_transforms_has_its_focal_length_or_angle(tmp_path, lens, focals):
+    """Where one has neither, it has the other's focal length, as in instant-ngp."""
+    document = transforms([{"file_path": "a"} | lens], w=40, h=20)
+    del document["camera_angle_x"]
+    (camera,) = read_cameras(write_json(tmp_path / "transforms.json", document | {"w": 40, "h": 20})).train
+    assert (camera.fx, camera.fy) == pytest.approx(focals)
+
+
+def test_what_is_not_read_beside_the_cameras_is_told(tmp_path):
+    frames = [{"file_path": r"images\a.png", "mask_path": "masks/a.png"}]
+    photo(tmp_path / "images" / "a.png", 3000, 10)
+    path = write_json(tmp_path / "transforms.json", transforms(frames, w=3000, h=10))
+    cameras = read_cameras(tmp_path)
+    assert cameras.train[0].photo == tmp_path / "images" / "a.png"
+    told = "\n".join(cameras.notes)
+    assert "masks are not read" in told
+    assert "nerfstudio halves larger ones: `train_scale` sets it" in told
+    assert "train_scale" not in "".join(read_cameras(path, train_scale=0.5).notes[:-1]).replace(
+        "0.5: `train_scale`", ""
+    )
+    colmap_bin(tmp_path / "sparse" / "0")
+    colmap_bin(tmp_path / "sparse" / "1")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "images_4").mkdir()
+    told = "\n".join(read_cameras(tmp_path).notes)
+    assert "masks are not read" in told
+    assert (
+        "photos: images holds none of these cameras' (a.b.png); `images` names another folder, such as images_4" in told
+    )
+    assert "other models beside 0, not read: 1" in told
+    assert "other cameras in the folder, not read: transforms.json (nerfstudio, instant-ngp)" in told
+
+
+@pytest.mark.parametrize(
     ("frame", "message"),
     [
         ({"k1": "a"}, "frame 0: k1 should be a number"),
@@ -517,6 +572,7 @@ def test_transforms_name_what_is_wrong(tmp_path, frame, message):
         ({"k1": -0.1, "k3": 0.2}, "PINHOLE", (-0.1, 0, 0, 0, 0.2)),
         ({"k4": 0.1, "camera_model": "OPENCV"}, "OPENCV", None),  # nerfstudio's own
         ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, "OPENCV_FISHEYE", (0, 0, 0, 0.1)),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": -0.1}, "SIMPLE_RADIAL", (-0.1, 0, 0, 0, 0)),  # a k1 to nerfstudio
         ({"is_fisheye": True}, "fisheye", (0, 0, 0, 0)),
         ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO", None),
     ],
@@ -585,8 +641,17 @@ def test_nerfstudios_lists_are_the_split(tmp_path):
     cameras = read_cameras(path)
     assert (names(cameras.train), names(cameras.test)) == (["a", "c"], ["b"])
     assert len(read_cameras(path, test_every=0).train) == 3
+    for changed, train, test in [
+        ({"train_filenames": ["./a.png", ".\\c.png"]}, ["a", "c"], ["b"]),
+        ({"train_filenames": ["a.png"], "test_filenames": []}, ["a"], ["b", "c"]),
+        ({"test_filenames": ["b.png"]}, ["a", "c"], ["b"]),
+    ]:
+        cameras = read_cameras(write_json(path, transforms(frames, w=40, h=20, **changed)))
+        assert (names(cameras.train), names(cameras.test)) == (train, test)
     write_json(path, transforms(frames, w=40, h=20, **lists | {"train_filenames": "a.png"}))
     refused(path, "train_filenames should be a list")
+    write_json(path, transforms(frames, w=40, h=20, val_filenames=["b.jpg"]))
+    refused(path, "val_filenames should be paths of frames, not 'b.jpg'")
 
 
 def test_the_dataparsers_transform_takes_poses_to_the_trained_frame(tmp_path):
@@ -851,6 +916,6 @@ def test_one_scene_has_the_same_poses_in_all_its_formats(shared_data):
 def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
     folders = sorted((shared_data / "formats" / "inria").rglob("original_3dgs_train/*"))
     folder = min(folders, key=lambda folder: (folder / "cameras.json").stat().st_size)
-    listed = [entry["img_name"] for entry in json.loads((folder / "cameras.json").read_text())]
+    listed = [without_suffix(entry["img_name"]) for entry in json.loads((folder / "cameras.json").read_text())]
     cameras = read_cameras(folder)
     assert names(cameras.test) == listed[: len(cameras.test)]

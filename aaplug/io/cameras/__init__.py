@@ -108,7 +108,9 @@ def read_cameras(
                 if not error.where.startswith("camera "):  # but an option
                     raise
                 raise FormatError(path, str(error)) from error
-            return replace(cameras, files=files_of(path, cameras))
+            others = [f.sign for f in formats if f.read != format.read and path.is_dir() and f.sniff(path)]
+            more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
+            return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
     if any(format.sniff(path) for format in PATH_FORMATS):
         raise FormatError(path, "is of a format of camera paths, which `path` of render and video takes")
     signs = "; ".join(format.sign for format in formats)

@@ -7,7 +7,7 @@ lengths and principal points are in px.  A camera keeps its lens, as far as `cor
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.lenses import EQUIRECT, Lens, opencv_lens
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
-from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
@@ -59,14 +58,16 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     photos = photo_folder(root, options, "images", Place(folder, "images"))
     source = [_camera(image, intrinsics) for image in images]
     source = with_photos(source, [image.place for image in images], photos)
+    more = [*photos.notes(source), *_other_models(folder)]
     names = distinct(images_file, [image.name for image in images], (without_suffix, str))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
-    sizes, why = _training_sizes(source, options)
+    sizes, why = sets.photo_sizes_or_scaled(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
     trained = cameras_of_photographs(sets.trained_at(source, sizes), lenses, options.undistort)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
-    return sets.camera_set(kind, source, split, why, more=lens_notes(lenses, trained, options.undistort))
+    more += lens_notes(lenses, trained, options.undistort)
+    return sets.camera_set(kind, source, split, why, more=more)
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -87,15 +88,11 @@ def _files(folder: Path) -> tuple[Path, Path]:
     raise FormatError(folder, f"{needs}; found {there or 'neither'}")
 
 
-def _training_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[sets.Size], str]:
-    if options.train_scale is not None:
-        return sets.file_sizes(cameras, options)
-    there = sum(camera.photo is not None for camera in cameras)
-    sizes = sets.photo_sizes(cameras)
-    why = f"size of the {there} photos found" if there else "size in the file, no photos found"
-    if max(width for width, _ in sizes) > WIDTH_CAP:
-        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: `train_scale` sets it"
-    return sizes, why
+def _other_models(folder: Path) -> list[str]:
+    """A note on models beside this one of a folder that numbers them: parts that COLMAP could not join."""
+    there = {file.parent.name for kind in KINDS for file in folder.parent.glob(f"[0-9]*/images{kind}")}
+    others = sorted(there - {folder.name}) if folder.name.isdigit() else []
+    return [f"other models beside {folder.name}, not read: {listing(others)}"] if others else []
 
 
 def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:

@@ -16,7 +16,7 @@ from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import cfg_args, sets
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
-from aaplug.io.cameras.photos import photo_folder, with_photos
+from aaplug.io.cameras.photos import photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
@@ -47,6 +47,9 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     for camera in source:  # some runs list a view once per split
         views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
     source = list(views.values())
+    short = [without_suffix(camera.name) for camera in source]
+    if len({*short}) == len({camera.name for camera in source}):
+        source = [replace(camera, name=name) for camera, name in zip(source, short, strict=True)]
     sizes, why = _training_sizes(source, settings, options)
     split = _split(sets.trained_at(source, sizes), settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]

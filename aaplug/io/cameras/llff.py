@@ -42,17 +42,19 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         names = sorted(p.name for p in folder.folder.iterdir() if p.suffix.lower() in SUFFIXES)
     except OSError:
         names = []
-    if len(names) != len(rows):
+    photos = len(names)
+    if photos != len(rows):
         names = [f"{i:03}" for i in range(len(rows))]
     places = [Place(file, f"row {i}") for i in range(len(rows))]
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
-    photo_rule = sets.photo_sizes(source), "size of the photos, or in the file"
-    sizes, why = photo_rule if options.train_scale is None else sets.file_sizes(source, options)
+    uneven = f"photos: {folder.folder.name} holds {photos} and the file {len(rows)} poses, so none is used"
+    more = folder.notes(source) if photos in (0, len(rows)) else [uneven]
+    sizes, why = sets.photo_sizes_or_scaled(source, options)
     trained = sets.trained_at(source, sizes)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
-    return sets.camera_set(f"LLFF {FILE}", source, split, why)
+    return sets.camera_set(f"LLFF {FILE}", source, split, why, more=more)
 
 
 def _rows(file: Path) -> np.ndarray:

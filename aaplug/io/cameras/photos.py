@@ -20,8 +20,10 @@ from aaplug.system.errors import FormatError, UsageError, listing
 CAMERA_FILE = re.compile(  # of any format
     r"(dataparser_)?transforms.*\.json|(cameras|metadata)\.json|cfg_args|poses_bounds\.npy|(cameras|images|points3D)\..*"
 )
+MASKS = "masks"  # a folder beside those of photos
 PHOTO_FOLDERS = (re.compile("train|test|val"), re.compile(r"images(_\d+)?"))  # that data sets have beside each other
 COMMON_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
+MASKED = "masks are not read: metrics count every pixel of the photos"
 SUFFIXES = (*COMMON_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
 
 
@@ -53,6 +55,16 @@ class PhotoFolder:
             hint = f"{other}where a link leads there, copy it, or link the whole data set"
             raise place.error(f"photo {name!r} lies outside {self.home}; {hint}")
         return photo
+
+    def notes(self, cameras: Sequence[Camera]) -> list[str]:
+        """What to tell where no camera has its photo although there are folders of photos, or where there are masks."""
+        beside = _listed(self.folder.parent)
+        others = [path.name for path in beside if PHOTO_FOLDERS[1].fullmatch(path.name) and path != self.folder]
+        notes = [MASKED] if any(path.name == MASKS for path in beside) else []
+        if photographs(cameras) or not (others or self.folder in beside):
+            return notes
+        hint = "`images` names another folder" + (f", such as {listing(others)}" if others else "")
+        return [f"photos: {self.folder.name} holds none of these cameras' ({cameras[0].name}); {hint}", *notes]
 
 
 def photo_folder(root: Path, options: CameraFileOptions, custom: str, place: Place) -> PhotoFolder:

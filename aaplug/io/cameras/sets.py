@@ -8,7 +8,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, photographs
+from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import check_fields
@@ -87,7 +88,23 @@ def file_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[l
     most = whole_limit("CAMERA_SIDE")
     if max(map(max, sizes), default=0) > most:
         raise UsageError("train_scale", f"makes an image of more than {most} px a side")
-    return sizes, "size in the file" + ("" if scale is None else f" × {scale:g}: `train_scale`")
+    why = "size in the file"
+    return sizes, f"{why}{_uncapped(sizes)}" if scale is None else f"{why} × {scale:g}: `train_scale`"
+
+
+def photo_sizes_or_scaled(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
+    """The sizes of the cameras' photos, unless the user chose `train_scale`; and the reason, for a note."""
+    if options.train_scale is not None:
+        return file_sizes(cameras, options)
+    there, sizes = len(photographs(cameras)), photo_sizes(cameras)
+    why = f"size of the {counted(there, 'photo')} found" if there else "size in the file, no photos found"
+    return sizes, why + _uncapped(sizes)
+
+
+def _uncapped(sizes: Sequence[Size]) -> str:
+    """What to add to the reason for sizes that trainers make smaller."""
+    caps = f"; 3DGS caps the width at {WIDTH_CAP} px and nerfstudio halves larger ones: `train_scale` sets it"
+    return caps if max(map(max, sizes), default=0) > WIDTH_CAP else ""
 
 
 def photo_sizes(cameras: Sequence[Camera]) -> list[Size]:

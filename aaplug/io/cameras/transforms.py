@@ -1,7 +1,8 @@
 """`transforms*.json` of Blender (NeRF-synthetic), instant-ngp and nerfstudio.
 
 frames: [{file_path, transform_matrix}].  transform_matrix: camera-to-world, OpenGL axes, world units.  The focal length
-is fl_x and fl_y, in px, or follows from camera_angle_x, the full horizontal angle in radians; w, h, cx, cy are in px.
+of an axis is fl_x or fl_y, in px, or follows from camera_angle_x or camera_angle_y, the full angle in radians; an axis
+without either has that of the other.  w, h, cx, cy are in px.
 Keys beside `frames` are defaults for all frames.  Without w and h, the photos give the size.  Paths are relative to the
 file.  nerfstudio's dataparser_transforms.json, {transform: 3×4, scale}, beside the file maps poses to the frame of the
 trained scene: with the rotation R and the translation t, a point p becomes scale · (R p + t).
@@ -13,7 +14,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from jaxtyping import Float
@@ -23,7 +24,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.lenses import EQUIRECT, opencv_lens
 from aaplug.io.cameras import sets
-from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
+from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import PNG_SIGNATURE, image_size
@@ -33,13 +34,14 @@ from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
 STEREO = ("OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # if the coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
 FISHEYE = "OPENCV_FISHEYE"
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 MIN_ANGLE = 1e-9  # rad: the smallest angle of view
 FILE_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's split
+MASK = "mask_path"
 PNG_COLOUR_TYPE = 25  # byte of the header
 PNG_ALPHA = (b"\4", b"\6")  # colour types with alpha: gray and RGB
 DATAPARSER = "dataparser_transforms.json"
@@ -103,8 +105,8 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     frames = entries(file, "frame", document["frames"], shared)
     exported = any(EXPORTED in frame for frame in frames)
     folder = PhotoFolder(file.parent, file.parent)
-    photos = [None if EXPORTED in f else folder.find(f.get("file_path", text), f.place) for f in frames]
-    paths = [frame.get("file_path", text) for frame in frames]
+    paths = [_plain(frame.get("file_path", text)) for frame in frames]
+    photos = [None if EXPORTED in f else folder.find(path, f.place) for f, path in zip(frames, paths, strict=True)]
     found = [str(photo.relative_to(file.parent)) if photo else path for path, photo in zip(paths, photos, strict=True)]
     names = distinct(file, found, (last_part, without_suffix, str))
     photo = next(filter(None, photos), None)
@@ -120,6 +122,8 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
         notes.append(f"frame: that of {DATAPARSER} (scale {parser[1]:g}), in which nerfstudio trains")
     elif "applied_transform" in document:
         notes.append(f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it")
+    if any(MASK in frame for frame in frames):
+        notes.append(MASKED)
     return Source(tuple(cameras), _held_out(file, document, paths), tuple(notes))
 
 
@@ -154,15 +158,24 @@ def _dataparser(path: Path) -> Dataparser | None:
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
     """True for each frame that nerfstudio's lists of file names keep from training; None without lists."""
-    lists = {key: document[key] for key in FILE_LISTS if key in document}
-    if FILE_LISTS[0] not in lists:
-        return None
+    lists, frames = dict[str, set[str]](), set(paths)
     place = object_of(document, file, "lists of file names", "frames").place
-    for key, listed in lists.items():
+    for key in filter(document.__contains__, FILE_LISTS):
+        listed = document[key]
         right = isinstance(listed, list) and all(isinstance(path, str) for path in listed)
         place.expect(right, key, "a list of paths", listed)
-    train = set(lists[FILE_LISTS[0]])
+        for path in listed:
+            place.expect(_plain(path) in frames, key, "paths of frames", path)
+        lists[key] = set(map(_plain, listed))
+    if not lists:
+        return None
+    train = lists.get(FILE_LISTS[0], frames.difference(*lists.values()))
     return tuple(path not in train for path in paths)
+
+
+def _plain(path: str) -> str:
+    """A path with slashes between its parts, as Windows' programs may not write it, and without `.`."""
+    return str(PurePosixPath(path.replace("\\", "/")))
 
 
 def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
@@ -186,14 +199,19 @@ def _intrinsics(entry: Entry, width: int, height: int) -> tuple[float, float, fl
     """fx, fy, cx and cy, in px; those of a panorama follow from its size."""
     if entry.get("camera_model", text, PINHOLES[0]) == PANORAMA:
         return panorama(width, height)
-    if "fl_x" in entry or "camera_angle_x" not in entry:
-        fx = entry.get("fl_x", focal)
-    else:
-        angle = entry.get("camera_angle_x", number)
-        entry.place.expect(MIN_ANGLE <= angle < math.pi, "camera_angle_x", "above 0 and below π, in radians", angle)
-        fx = focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
-    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
-    return fx, fy, cx, cy
+    fx, fy = _focal(entry, "x", width), _focal(entry, "y", height)
+    fx = fx or fy or entry.get("fl_x", focal)  # which is missing
+    return fx, fy or fx, entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
+
+
+def _focal(entry: Entry, axis: str, side: int) -> float | None:
+    """The focal length of an axis, in px, None if the file gives neither it nor the angle of view."""
+    length, field = f"fl_{axis}", f"camera_angle_{axis}"
+    if length in entry or field not in entry:
+        return entry.get(length, focal) if length in entry else None
+    angle = entry.get(field, number)
+    entry.place.expect(MIN_ANGLE <= angle < math.pi, field, "above 0 and below π, in radians", angle)
+    return focal(side / 2 / math.tan(angle / 2), entry.place, f"{field}'s focal length")
 
 
 def _distortion(entry: Entry) -> Distortion | None:
