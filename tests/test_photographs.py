@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from aaplug.core.imaging import box_average, quantised
+from aaplug.core.imaging import box_average, quantised, stretched
 from aaplug.io.images import read_image
 from aaplug.io.photographs import DOWNSCALES, photo_at
 from aaplug.system.errors import UsageError
@@ -31,14 +31,14 @@ def test_every_way_keeps_size_and_range(rgba, name):
     photo = DOWNSCALES[name].read(rgba, WHITE)
     assert photo.hw == (16, 24)
     for factor, hw in ((1.0, (16, 24)), (0.5, (8, 12)), (0.25, (4, 6))):
-        image = photo.at(hw, factor)
+        image = photo.at(hw, (factor, factor))
         assert image.shape == (*hw, 3)
         assert 0 <= image.min() <= image.max() <= 1
 
 
 def test_box_composites_rounds_and_averages(rgba):
     expected = box_average(quantised(read_image(rgba, WHITE)), 4)
-    assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25).equal(expected)
+    assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), (0.25, 0.25)).equal(expected)
 
 
 def test_rgba_box_averages_straight_alpha_and_cuts_twice(rgba):
@@ -46,22 +46,22 @@ def test_rgba_box_averages_straight_alpha_and_cuts_twice(rgba):
     small = bgra.reshape(4, 4, 6, 4, 4).mean(axis=(1, 3))
     saved = np.floor(small * 255 + 1e-6) / 255
     composited = saved[..., :3] * saved[..., 3:] + 1 - saved[..., 3:]
-    found = DOWNSCALES["rgba-box"].read(rgba, WHITE).at((4, 6), 0.25)
+    found = DOWNSCALES["rgba-box"].read(rgba, WHITE).at((4, 6), (0.25, 0.25))
     levels = np.floor(composited * 255 + 1e-3)
     assert np.abs((found * 255).round().numpy() - levels).max() == 0
 
 
 def test_rgba_box_refuses_what_is_not_halved(rgba):
     with pytest.raises(UsageError, match="power of 1/2"):
-        DOWNSCALES["rgba-box"].read(rgba, WHITE).at((5, 8), 1 / 3)
+        DOWNSCALES["rgba-box"].read(rgba, WHITE).at((5, 8), (1 / 3, 1 / 3))
 
 
 def test_pil_bicubic_is_pillows(rgba):
     pixels = (quantised(read_image(rgba, WHITE)) * 255).round().byte().numpy()
     small = np.array(Image.fromarray(pixels).resize((6, 4), Image.Resampling.BICUBIC))
-    found = DOWNSCALES["pil-bicubic"].read(rgba, WHITE).at((4, 6), 0.25)
+    found = DOWNSCALES["pil-bicubic"].read(rgba, WHITE).at((4, 6), (0.25, 0.25))
     assert torch.allclose(found, torch.from_numpy(small).float() / 255)
-    assert not torch.allclose(found, DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25))
+    assert not torch.allclose(found, DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), (0.25, 0.25)))
 
 
 @pytest.mark.parametrize("width", [12, 24, 48])
@@ -70,3 +70,11 @@ def test_a_photograph_shows_the_whole_view_whatever_size_the_view_was_trained_at
     view = replace(make_camera(size=(width, width * 2 // 3)), photo=rgba)
     expected = box_average(quantised(read_image(rgba, WHITE)), 4)
     assert photo_at(view, view.scaled(6 / width), WHITE).equal(expected)
+
+
+def test_a_view_trained_at_a_rounded_size_is_compared_with_the_whole_photograph(rgba):
+    """3DGS stretches the photograph to that size, and its cameras keep their field of view."""
+    view = replace(make_camera(size=(10, 6)), photo=rgba)  # 6.67 rows, cut
+    whole = quantised(read_image(rgba, WHITE))
+    assert torch.allclose(photo_at(view, view, WHITE), stretched(whole, (6, 10)), atol=1e-6)
+    assert torch.allclose(photo_at(view, view.scaled(1 / 2), WHITE), stretched(whole, (3, 5)), atol=1e-6)

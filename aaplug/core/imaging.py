@@ -1,6 +1,6 @@
 """Images as arrays: compositing over a background, resampling, and rounding to stored bits.
 
-Images are [h, w, 3] in [0, 1].  A `factor` is the density of the new pixels against the old ones.
+Images are [h, w, 3] in [0, 1].  A factor is the density of the new pixels against the old ones.
 """
 
 import math
@@ -17,6 +17,7 @@ from aaplug.core.splats import Render
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError
 
+Factors = tuple[float, float]  # of rows and of columns
 SRGB_KNEE = 0.04045  # up to which sRGB is proportional to light
 
 
@@ -58,9 +59,9 @@ def box_average(image: Float[Tensor, "h w c"], n: int) -> Float[Tensor, "H W c"]
 
 
 def resampled(
-    rgb: Float[Tensor, "h w 3"], factor: float, hw: tuple[int, int] | None = None
+    rgb: Float[Tensor, "h w 3"], factor: float | Factors, hw: tuple[int, int] | None = None
 ) -> Float[Tensor, "h2 w2 3"]:
-    """Resample by `factor`: box averages below 1, bicubic above.
+    """Resample by `factor`, of both axes or of rows and columns: box averages below 1, bicubic above.
 
     Boxes are exact where 1/factor is whole, else area-weighted.  A partial pixel at the bottom or the right is
     cropped; `hw` asks for that height and width.
@@ -69,15 +70,16 @@ def resampled(
         UsageError: no box fits into the image.
     """
     height, width, _ = rgb.shape
-    hw = hw or (whole_side(height * factor), whole_side(width * factor))
-    if factor == 1:
+    down, factor = factor if isinstance(factor, tuple) else (factor, factor)
+    hw = hw or (whole_side(height * down), whole_side(width * factor))
+    if down == factor == 1:
         return rgb[: hw[0], : hw[1]]
-    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE_SLACK:
+    if factor < 1 and max(abs(1 / each - round(1 / factor)) for each in (down, factor)) < WHOLE_SLACK:
         box = round(1 / factor)
         if box > min(height, width):
             raise UsageError("scale", f"{factor:g} leaves no pixel of a {width}x{height} image")
         return box_average(rgb, box)[: hw[0], : hw[1]]
-    source = rgb[: math.ceil(hw[0] / factor - WHOLE_SLACK), : math.ceil(hw[1] / factor - WHOLE_SLACK)]
+    source = rgb[: math.ceil(hw[0] / down - WHOLE_SLACK), : math.ceil(hw[1] / factor - WHOLE_SLACK)]
     return _resized(source, hw, cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
 
 

@@ -153,14 +153,16 @@ class ViewTruth:
         if truth.protocol.change != "size":
             return TimedRenderer(truth.supersampled(scale))(camera).rgb
         if truth.source == "photographs":
-            factor = self._photograph.factor(self.view, scale)
-            if factor <= 1:
-                return self._photograph.at(camera.hw, factor)
+            factors = self._photograph.factors(self.view, scale)
+            if factors[1] <= 1:
+                return self._photograph.at(camera.hw, factors)
         elif truth.renderer.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)
         if truth.enlarge is not None:
             photographs = truth.source == "photographs"
-            full = self._photograph.at(self._photograph.hw, 1.0) if photographs else self.look.rgb.clamp(0.0, 1.0)
+            full = (
+                self._photograph.at(self._photograph.hw, (1.0, 1.0)) if photographs else self.look.rgb.clamp(0.0, 1.0)
+            )
             return truth.enlarge(truth.renderer, full, camera).clamp(0.0, 1.0)
         if truth.source == "photographs":
             return None

@@ -16,12 +16,12 @@ from PIL import Image
 from torch import Tensor
 
 from aaplug.core.cameras import WHOLE_SLACK, Camera, Undistortion
-from aaplug.core.imaging import box_average, levels, quantised, resampled
+from aaplug.core.imaging import Factors, box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
 from aaplug.system.errors import FormatError, UsageError
 
-At = Callable[[tuple[int, int], float], Float[Tensor, "h w 3"]]
+At = Callable[[tuple[int, int], Factors], Float[Tensor, "h w 3"]]
 Background = tuple[float, float, float]
 MAX_LEVEL = 255  # of 8 bits
 
@@ -31,16 +31,17 @@ class Photograph:
     """One photograph in memory.
 
     hw: its height and width, in px.
-    at: called with a height and width and a factor up to 1, the photograph of that size, `factor` times as dense.
+    at: called with a height and width and factors up to 1, the photograph of that size, with so much denser rows and
+        columns.
     """
 
     hw: tuple[int, int]
     at: At
 
-    def factor(self, view: Camera, scale: float) -> float:
+    def factors(self, view: Camera, scale: float) -> Factors:
         """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.
 
-        A photograph may be larger or smaller than the size at which its view was trained.
+        A photograph may be larger or smaller than the size at which its view was trained, of which a side was rounded.
 
         Raises:
             FormatError: it is not of the camera's shape.
@@ -49,7 +50,7 @@ class Photograph:
         if abs(height - width * view.height / view.width) > rounding:
             cameras = f"the cameras say {view.width}x{view.height}"
             raise FormatError(view.photo or view.name, f"is {width}x{height} px, of another shape than {cameras}")
-        return scale * view.width / width
+        return scale * view.height / height, scale * view.width / width
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,12 @@ def photo_at(view: Camera, resized: Camera, background: Background) -> Float[Ten
     """
     assert view.photo is not None
     photograph = _box(view.photo, background, view.undistortion)
-    return photograph.at(resized.hw, photograph.factor(view, resized.fx / view.fx))
+    return photograph.at(resized.hw, photograph.factors(view, resized.fx / view.fx))
 
 
 def _box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
     photo = read_photo(path, background, undistortion)
-    return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw))
+    return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factors: resampled(photo, factors, hw))
 
 
 def _rgba_box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
@@ -88,7 +89,8 @@ def _rgba_box(path: Path, background: Background, undistortion: Undistortion | N
     halves = [undistorted(read_rgba(path), undistortion)]
     behind = torch.tensor(background)
 
-    def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
+    def at(hw: tuple[int, int], factors: Factors) -> Float[Tensor, "h w 3"]:
+        factor = factors[1]
         depth = round(math.log2(1 / factor))
         if abs(factor * 2**depth - 1) > WHOLE_SLACK:
             raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
@@ -110,7 +112,7 @@ def _pil_bicubic(path: Path, background: Background, undistortion: Undistortion 
     photo = read_photo(path, background, undistortion)
     picture = Image.fromarray(levels(photo, 8).byte().numpy())
 
-    def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
+    def at(hw: tuple[int, int], factors: Factors) -> Float[Tensor, "h w 3"]:
         small = picture.resize((hw[1], hw[0]), Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(small, dtype=np.float32) / MAX_LEVEL)
 
