@@ -267,6 +267,17 @@ def colmap_txt(folder, cameras=CAMERAS, images=IMAGES, points="1.5 2.5 9 3.5 4.5
     return folder
 
 
+@pytest.mark.parametrize("name", ["a.png", "0001", "a b c.png"])
+def test_a_text_model_without_lines_of_points_loses_no_view(tmp_path, name):
+    """COLMAP takes every second line for points, whatever it holds."""
+    views = tuple((i, (1.0, 0, 0, 0), (0.0, 0, 0), 1, f"{i}{name}") for i in range(3))
+    colmap_txt(tmp_path, images=views, points="")
+    assert len(read_cameras(tmp_path).all) == 3
+    file = tmp_path / "images.txt"
+    file.write_text(file.read_text().replace("\n\n", "\n"))
+    refused(tmp_path, "images.txt: line 3: it should be the points of the image above, X Y POINT3D_ID each, or empty")
+
+
 def one_camera(model, values):
     return ((1, model, 400, 200, values),), ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "a.png"),)
 

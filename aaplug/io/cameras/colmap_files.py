@@ -7,6 +7,7 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import os
+import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ IMAGE_RECORD = struct.Struct("<I7dI")  # id, quaternion, translation, camera id;
 MIN_CAMERA_SIZE = CAMERA_RECORD.size + 2 * 8  # bytes: every model has 2 parameters or more
 MIN_IMAGE_SIZE = IMAGE_RECORD.size + 1 + COUNT_RECORD.size  # bytes: an empty name has its NUL
 CAMERA_FIELDS = 4  # id, model, width, height
+NUMBER = re.compile(rb"[-+.\deE]+")
 IMAGE_FIELDS = 10  # id, 4 of the quaternion, 3 of the translation, camera id, name
 
 
@@ -204,7 +206,16 @@ def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
         motion = tuple(_parsed(float, field, place) for field in fields[1:8])
         name = text(fields[-1].strip(), place, "name")
         yield Image(place, name, _parsed(int, fields[8], place), motion[:4], motion[4:])
-        next(lines, None)  # the image's points, an empty line if there are none
+        if points := next(lines, None):  # of the image, an empty line if there are none
+            _check_points(Place(file, f"line {points[0]}"), points[1])
+
+
+def _check_points(place: Place, line: bytes) -> None:
+    """Refuse what is no line of points, so that no image is taken for one; only as many fields as an image's count."""
+    fields = line.split(maxsplit=IMAGE_FIELDS)
+    whole = len(fields) > IMAGE_FIELDS or len(fields) % 3 == 0
+    right = whole and all(map(NUMBER.fullmatch, fields[:IMAGE_FIELDS]))
+    place.expect(right, "it", "the points of the image above, X Y POINT3D_ID each, or empty", line)
 
 
 def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
