@@ -609,6 +609,8 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
         lens = opencv_lens(tuple(map(float, coefficients)), "fisheye" in name.lower())
         assert first.undistortion.lens == bent.lens == lens
         assert (bent.fx, bent.cx, bent.photo) == (30, 19, tmp_path / "a.png")
+    (tmp_path / "a.png").unlink()  # the lens is drawn without its photograph, too
+    assert ("drawn as pinholes" in read_cameras(file).notes[-1]) == (coefficients is None)
 
 
 EXPORTED = {"file_path": "/elsewhere/a.png", "fl_x": 30.0, "fl_y": 31.0, "w": 40, "h": 20}

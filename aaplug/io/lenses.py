@@ -96,7 +96,7 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
     if not pairs:
         return notes
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
-    usable = sum(lens.lens is not None and camera.photo is not None for lens, camera in pairs)
+    usable = sum(lens.lens is not None and (camera.photo is not None or not undistort) for lens, camera in pairs)
     if undistort:
         what = "renders are of the pinhole at its centre; photos are undistorted and cropped to what they cover"
     else:
