@@ -24,7 +24,7 @@ from aaplug.system.extras import install_command
 from aaplug.system.locks import SCRATCH_PREFIX, remove_left
 from aaplug.system.monitor import SILENT, Monitor
 from tests.test_batch import timeless
-from tests.test_executors import refuse_three
+from tests.work import deadly_once, refuse_three
 
 cluster = pytest.importorskip("aaplug.system.cluster")  # its package is an extra
 
@@ -71,14 +71,6 @@ def started(*words: str) -> Iterator[subprocess.Popen[str]]:
 def line_of(process: subprocess.Popen[str], said: str) -> str:
     """The line of a process's log that holds these words; waits for it."""
     return next(line for line in process.stderr or () if said in line)
-
-
-def deadly_once(mark: Path, item: int) -> int:
-    """The square; the first worker of item 2 dies."""
-    if item == 2 and not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return item * item
 
 
 @pytest.fixture(scope="module")

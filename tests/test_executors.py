@@ -3,13 +3,18 @@
 import math
 import os
 import platform
+import resource
 import signal
 import subprocess
 import sys
 import time
-from itertools import count
+from contextlib import suppress
+from functools import partial
+from itertools import chain, count
+from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import psutil
 import pytest
 import torch
@@ -17,41 +22,14 @@ import torch
 import aaplug
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.rasterizers.tiled import Tiled
+from aaplug.rendering.renderer import Renderer
 from aaplug.system import groups
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
-from aaplug.system.errors import FormatError, UsageError, within_memory
+from aaplug.system.errors import FormatError, OutputError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, given_threads, torch_threads
 from aaplug.system.monitor import Monitor
-from tests.conftest import ROOT, SAMPLE, run_python
-
-PARENT = """
-import time
-from aaplug.system.executors import Processes
-if __name__ == "__main__":
-    for _ in Processes(1).map(time.sleep, [0, 1000]):
-        print("working", flush=True)
-"""
-
-
-FULL = """
-import resource
-from functools import partial
-import torch
-from aaplug.system.errors import OutputError
-from aaplug.system.executors import Processes
-if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    try:
-        list(Processes(1).map(partial(torch.add, torch.zeros(10**6)), [1]))
-    except OutputError as error:
-        print(error)
-"""
-
-
-def refuse_three(item: int) -> int:
-    if item == 3:
-        raise FormatError("scene.ply", "is short")
-    return item * item
+from tests.conftest import ROOT, SAMPLE, exit_code, make_camera, make_scene, run_python
+from tests.work import refuse_three
 
 
 @pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
@@ -76,29 +54,16 @@ def test_a_process_that_dies_is_one_clear_error():
         list(Processes(1).map(os._exit, [3]))
 
 
-def test_a_worker_ends_when_its_parent_is_killed(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(PARENT)
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, str(script)], **streams) as parent:
-        assert parent.stdout is not None
-        assert parent.stderr is not None
-        assert parent.stdout.readline() == b"working\n"
-        workers = psutil.Process(parent.pid).children()
-        parent.kill()
-        gone, alive = psutil.wait_procs(workers, timeout=30)
-        assert parent.stderr.read() == b""  # Python's resource tracker warns of what it removes
-    assert gone
-    assert not alive
+def test_a_disk_that_is_full_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
+    def fill() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+        with pytest.raises(OutputError, match=r"work\.pt: cannot be written: file too large$"):
+            list(Processes(1).map(partial(torch.add, torch.zeros(10**6)), [1]))
 
-def test_a_disk_that_is_full_is_named(tmp_path):
-    script = tmp_path / "full.py"
-    script.write_text(FULL)
-    environment = os.environ | {"TMPDIR": str(tmp_path)}
-    process = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=60)
-    assert process.stdout.endswith("work.pt: cannot be written: file too large\n")
-    assert list(tmp_path.iterdir()) == [script]
+    assert exit_code(fill) == 0
+    assert not list(tmp_path.iterdir())
 
 
 def test_torch_threads_are_given_back():
@@ -218,8 +183,9 @@ def test_a_verb_draws_with_the_threads_it_was_given_and_does_the_rest_with_one(t
     assert found == {"drawing": {2}, "rest": {1}}
 
 
-HOLDS = """
-import signal, time
+HOLD = """
+import os, signal, sys, time
+from pathlib import Path
 from aaplug.system.executors import Processes
 from aaplug.system.locks import scratch
 from aaplug.system.signals import end_as_by_interrupt
@@ -229,36 +195,48 @@ def hold(item):
         time.sleep(item)
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run where nohup ignores it
-    end_as_by_interrupt()
-    with scratch():
-        print("working", flush=True)
-        list(Processes(1).map(hold, [1000] * 9))
+    for folder in map(Path, sys.argv[1:]):
+        if os.fork() == 0:
+            os.setsid()
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run where nohup ignores it
+            os.environ["TMPDIR"] = str(folder)
+            os.dup2(os.open(folder.with_suffix(".err"), os.O_WRONLY | os.O_CREAT), 2)
+            end_as_by_interrupt()
+            folder.with_suffix(".pid").write_text(str(os.getpid()))
+            with scratch():
+                list(Processes(1).map(hold, [1000] * 9))
+    for _ in sys.argv[1:]:
+        os.wait()
 """
-
-
 HELD = "the program's", "the pool's", "the item's"  # folders of temporary files
+ENDS = {"SIGTERM": os.kill, "SIGHUP": os.killpg, "SIGKILL": os.kill}  # of a parent alone, and with its group
 
 
-@pytest.mark.parametrize(("name", "send"), [("SIGTERM", os.kill), ("SIGHUP", os.killpg)], ids=["parent", "group"])
-def test_signals_that_end_a_program_leave_no_worker_and_no_temporary_file(tmp_path, name, send):
-    script, temporary = tmp_path / "parent.py", tmp_path / "temporary"
-    script.write_text(HOLDS)
-    temporary.mkdir()
-    environment = os.environ | {"TMPDIR": str(temporary), "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, str(script)], env=environment, start_new_session=True, **streams) as parent:
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_no_worker_outlives_its_program_and_no_temporary_file_one_that_can_answer(tmp_path):
+    script, folders = tmp_path / "parent.py", [tmp_path / name for name in ENDS]
+    script.write_text(HOLD)
+    for folder in folders:
+        folder.mkdir()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    with subprocess.Popen([sys.executable, str(script), *map(str, folders)], env=environment) as starter:
+        while starter.poll() is None and not all(len([*f.glob("aaplug-scratch-*")]) == len(HELD) for f in folders):
+            time.sleep(0.01)
+        parents = [psutil.Process(int(folder.with_suffix(".pid").read_text())) for folder in folders]
+        started = [*parents, *chain.from_iterable(parent.children() for parent in parents)]
         try:
-            while parent.poll() is None and len([*temporary.glob("aaplug-scratch-*")]) < len(HELD):
-                time.sleep(0.01)
-            workers = psutil.Process(parent.pid).children()
-            send(parent.pid, getattr(signal, name))
-            _, err = parent.communicate(timeout=60)
+            for parent, (name, send) in zip(parents, ENDS.items(), strict=True):
+                send(parent.pid, getattr(signal, name))
+            assert not psutil.wait_procs(started, timeout=60)[1]
         finally:
-            parent.kill()
-    assert err.splitlines()[-1] == "KeyboardInterrupt", err
-    assert not psutil.wait_procs(workers, timeout=10)[1]
-    assert not [*temporary.iterdir()]
+            for process in started:
+                with suppress(psutil.NoSuchProcess):
+                    process.kill()
+    *ended, killed = folders
+    for folder in ended:
+        assert folder.with_suffix(".err").read_text().splitlines()[-1] == "KeyboardInterrupt", folder.name
+        assert not [*folder.iterdir()], folder.name
+    assert killed.with_suffix(".err").read_text() == ""  # Python's resource tracker warns of what it removes
 
 
 @pytest.mark.parametrize(
@@ -280,29 +258,18 @@ def test_other_errors_are_not_taken_for_lack_of_memory():
         raise RuntimeError("shape '[2]' is invalid for input of size 3")
 
 
-LIMITED = """if True:
-    import resource
-    from pathlib import Path
-    import torch
-    from aaplug.evaluation.laws.base import make_camera, make_scene
-    from aaplug.rendering.renderer import Renderer
-    from aaplug.system.errors import UsageError
-    torch.set_num_threads(1)
-    renderer = Renderer.of(make_scene(200), [make_camera()], "classic")
-    renderer(make_camera())
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + 1_000_000, resource.RLIM_INFINITY))
-    try:
-        renderer(make_camera(size=(6000, 4000)))
-    except UsageError as error:
-        print(error)
-"""
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_rendering_without_enough_memory_is_one_clear_error():
-    done = run_python(LIMITED)
-    assert done.stdout.startswith("view view at 6000x4000: out of memory;"), done
+    renderer = Renderer.of(make_scene(200), [make_camera()], "classic")
+
+    def draw() -> None:
+        jaxtyping.config.update("jaxtyping_disable", True)  # it has no memory either
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + 1_000_000, resource.RLIM_INFINITY))
+        with pytest.raises(UsageError, match=r"^view view at 6000x4000: out of memory;"):
+            renderer(make_camera(size=(6000, 4000)))
+
+    assert exit_code(draw) == 0
 
 
 SAME_BITS = """
@@ -338,7 +305,7 @@ if __name__ == "__main__":
     with ThreadPoolExecutor(2) as pool:
         print("threads", [*pool.map(draw, items)] == expected)
     print("pool", [*Threads(2).map(draw, items)] == expected)
-    print("processes", [*Processes(2).map(draw, items)] == expected)
+    print("processes", [*Processes(1).map(draw, items)] == expected)
 """
 
 
