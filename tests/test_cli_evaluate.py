@@ -72,7 +72,7 @@ def test_a_protocol_names_itself_and_its_flavours(cli):
     assert overridden["metrics"]["SSIM"].startswith("wang")
 
 
-def test_it_writes_a_report_and_inrias_folders(cli):
+def test_it_writes_a_report_and_inrias_folders(cli, plots_drawn_once):
     pytest.importorskip("flip_evaluator")
     words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 0.5"
     options = "--metric psnr,flip,flicker --report --layout inria --show r_0"
@@ -85,7 +85,7 @@ def test_it_writes_a_report_and_inrias_folders(cli):
     assert Path("out/results.csv").read_text().count("\n") == 4
 
 
-def test_overwriting_leaves_nothing_of_an_earlier_run_and_all_that_others_wrote(cli):
+def test_overwriting_leaves_nothing_of_an_earlier_run_and_all_that_others_wrote(cli, plots_drawn_once):
     own = ["note.txt", "plots/mine.png", "test/mip@0.5/renders/mine.png"]
     options = "scene.ply --cameras . -o out --rasterizer eager --metric psnr --scale 0.5"
     assert cli(f"evaluate {options} --recipe classic mip --report --layout inria")[0] == 0

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from aaplug_cli.main import main
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.system.errors import FormatError
-from tests.conftest import make_scene
+from tests.conftest import exit_code, make_scene
 
 LONG = "n" * 300
 FULL = Path("/dev/full")
@@ -40,13 +39,15 @@ def test_escapes_of_a_file_do_not_reach_the_terminal(cli):
 
 @pytest.mark.skipif(not FULL.exists(), reason="there is no device that is always full")
 @pytest.mark.parametrize("words", ["info scene.ply --json", "recipes", "--version"])
-def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):
-    program = [sys.executable, "-c", "from aaplug_cli.main import main; main()", *words.split()]
-    with FULL.open("w") as full:
-        done = subprocess.run(program, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == "error: output: no space left on device"
-    assert "Traceback" not in done.stderr
+def test_a_full_disk_behind_stdout_is_one_line(cli, words):
+    def run() -> None:
+        with FULL.open("w") as sys.stdout, Path("err").open("w") as sys.stderr:
+            main(words.split())
+
+    assert exit_code(run) == 2
+    err = Path("err").read_text()
+    assert err.splitlines()[-1] == "error: output: no space left on device"
+    assert "Traceback" not in err
 
 
 @pytest.mark.parametrize(
