@@ -55,8 +55,9 @@ needs_peak_memory = pytest.mark.skipif(not CLEAR_REFS.exists(), reason="peak mem
 
 
 def pytest_configure() -> None:
-    """Test processes run side by side; threads that wait for each other would stall them all."""
+    """Test processes run side by side; threads that wait for each other, or for the disk, would stall them all."""
     torch.set_num_threads(1)
+    os.fsync = lambda descriptor: None  # no test pulls the plug
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -30,9 +30,7 @@ class Package:
     @staticmethod
     def of(run: Callable[[list[Tensor]], list[Tensor]], kernel: Kernel) -> "Package":
         """The package that a kernel was compiled to."""
-        example = list(zip(kernel.example(), kernel.sizes, strict=True))
-        shapes = [arg.shape if size is None else arg.shape[1:] for arg, size in example]
-        return Package(run, [arg.dtype for arg, _ in example], shapes, kernel.sizes)
+        return Package(run, *_taken_by(kernel), kernel.sizes)
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """True if it can run these arguments; a leading size of one is a separate case to the compiler."""
@@ -41,6 +39,13 @@ class Package:
             if arg.dtype is not dtype or shape != expected or not arg.is_cpu or (size is not None and len(arg) < 2):
                 return False
         return True
+
+
+@cache
+def _taken_by(kernel: Kernel) -> tuple[list[torch.dtype], list[torch.Size]]:
+    """The types and shapes of a package's arguments; to make an example of them takes long."""
+    example = list(zip(kernel.example(), kernel.sizes, strict=True))
+    return [arg.dtype for arg, _ in example], [arg.shape if size is None else arg.shape[1:] for arg, size in example]
 
 
 class CompiledKernels(Kernels):
