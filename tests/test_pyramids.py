@@ -369,7 +369,7 @@ def test_a_broken_pyramid_is_refused_in_one_line(cli, folder, case):
 
 def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
     few = CameraSet(sample_cameras.train[:4], sample_cameras.test[:1])
-    scene, view = sample_scene[::6], few.test[0].scaled(0.25)
+    scene, view = sample_scene[::12], few.test[0].scaled(0.25)
     truth = Renderer.of(scene, few, "auto", quality="best")(view).rgb
     (merged,) = aaplug.lod(scene, few, simplify=0.1, scale=0.25, refine=False)
     for viewer, recipe in ((None, "matched"), ("spark-classic", "classic")):
