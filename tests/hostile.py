@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import jaxtyping
 import torch
 
 from aaplug.evaluation.survey import survey
@@ -142,6 +143,7 @@ def _in_a_child(name: str, files: list[bytes], target: Target) -> Counter[str]:
 
 def _work(target: Target, files: list[bytes], send) -> None:
     torch.set_num_threads(1)
+    jaxtyping.config.update("jaxtyping_disable", True)  # as users run it
     os.environ.update(target.environment)
     space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (space + MEMORY, space + MEMORY))
