@@ -70,17 +70,17 @@ def resampled(
         UsageError: no box fits into the image.
     """
     height, width, _ = rgb.shape
-    down, factor = factor if isinstance(factor, tuple) else (factor, factor)
-    hw = hw or (whole_side(height * down), whole_side(width * factor))
-    if down == factor == 1:
+    rows, columns = factor if isinstance(factor, tuple) else (factor, factor)
+    hw = hw or (whole_side(height * rows), whole_side(width * columns))
+    if rows == columns == 1:
         return rgb[: hw[0], : hw[1]]
-    if factor < 1 and max(abs(1 / each - round(1 / factor)) for each in (down, factor)) < WHOLE_SLACK:
-        box = round(1 / factor)
+    box = round(1 / columns)
+    if columns < 1 and max(abs(1 / each - box) for each in (rows, columns)) < WHOLE_SLACK:
         if box > min(height, width):
-            raise UsageError("scale", f"{factor:g} leaves no pixel of a {width}x{height} image")
+            raise UsageError("scale", f"{columns:g} leaves no pixel of a {width}x{height} image")
         return box_average(rgb, box)[: hw[0], : hw[1]]
-    source = rgb[: math.ceil(hw[0] / down - WHOLE_SLACK), : math.ceil(hw[1] / factor - WHOLE_SLACK)]
-    return _resized(source, hw, cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
+    source = rgb[: math.ceil(hw[0] / rows - WHOLE_SLACK), : math.ceil(hw[1] / columns - WHOLE_SLACK)]
+    return _resized(source, hw, cv2.INTER_AREA if columns < 1 else cv2.INTER_CUBIC)
 
 
 def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:

@@ -35,11 +35,12 @@ def filmed(
     apertures = [_aperture(view, options) for view in views]
     motions: Sequence[tuple[Camera, Camera]] = ()
     option = "camera_to" if camera_to else "shutter"
-    kinds = {(view.hw, view.lens.projection) for view in (*views, *camera_to)}
-    if (camera_to or shutter is not None) and any(projection == "ortho" for _, projection in kinds):
-        raise UsageError(option, "moves perspective views; the lens is ortho")
-    if (camera_to or shutter is not None) and len(kinds) > 1:
-        raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
+    if camera_to or shutter is not None:
+        kinds = {(view.hw, view.lens.projection) for view in (*views, *camera_to)}
+        if any(projection == "ortho" for _, projection in kinds):
+            raise UsageError(option, "moves perspective views; the lens is ortho")
+        if len(kinds) > 1:
+            raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
     if camera_to:
         if path or not len(views) == len(camera_to) == 1:
             raise UsageError("camera_to", "names one view, for one view that is not of a path")

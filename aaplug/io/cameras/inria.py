@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet, centred
+from aaplug.core.cameras import Camera, CameraSet, centred, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import cfg_args, sets
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
@@ -54,7 +54,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     split = _split(sets.trained_at(source, sizes), settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
     more = []
-    if settings and settings.source and not any(camera.photo for camera in source):
+    if settings and settings.source and not photographs(source):
         more = [
             f"photos: none found; training had them in {settings.source}/{settings.images}; `images` names a folder"
         ]
