@@ -87,8 +87,8 @@ def test_examples_show_what_compositing_computes(kernel: Kernel):
         assert not one.equal(other)
 
 
-# loops before it find and gather raster rows, a loop after it writes the sums out
-LOOPS = {"composite-point": 3, "composite-point-kept": 3, "composite-point-backward": 3, "gaussian-blending": 1}
+# loops before it find and gather raster rows, and evaluate forms at corners; a loop after it writes the sums out
+LOOPS = {"composite-point": 4, "composite-point-kept": 4, "composite-point-backward": 4, "gaussian-blending": 1}
 
 
 @pytest.mark.parametrize("name", LOOPS)

@@ -81,12 +81,15 @@ class Pixels(NamedTuple):
     """Pixel centres of square tiles, in px: each tile's top left corner, and x and y of its P centres from there.
 
     For a pixel kernel that `ReadsRays`, x, y and z of each pixel's ray instead.
+
+    at_corners: u and v of one splat per tile at the tile's corner, where a compiled pass has them.
     """
 
     corners: Float[Tensor, "t 2"]
     x: Float[Tensor, "*t P"]
     y: Float[Tensor, "*t P"]
     z: Float[Tensor, "t P"] | None = None
+    at_corners: tuple[Float[Tensor, " t"], Float[Tensor, " t"]] | None = None
 
 
 class Limits(NamedTuple):

@@ -16,9 +16,10 @@ from aaplug.methods.pixel_kernels.raster_rows import BLUE, RED
 
 
 class Move(NamedTuple):
-    """One splat per tile: its raster row, its weight at each pixel, and the gradient of log alpha there."""
+    """One splat per tile: its raster row, the pixels, its weight at each, and the gradient of log alpha there."""
 
     row: Float[Tensor, "t c"]
+    pixels: Pixels
     weight: Float[Tensor, "t P"]
     gradient: Float[Tensor, "t P"]
 
@@ -33,9 +34,7 @@ class SumsGradients(Protocol):
     @property
     def gradient_sums(self) -> int: ...  # noqa: D102
 
-    def sums(
-        self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t s_K"]:
+    def sums(self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor) -> Float[Tensor, "t s_K"]:
         """Sums over each tile's pixels of each splat.
 
         colours: gradient of each channel of the image.  T: transmittance before the first of the splats.
@@ -54,14 +53,20 @@ def sums_per_splat(pixel: PixelKernel, channels: int) -> int:
     return pixel.gradient_sums + channels if isinstance(pixel, SumsGradients) else pixel.columns
 
 
+def stacked(moves: list[Move]) -> tuple[Float[Tensor, "t K c"], Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
+    """Raster rows, weights and gradients of the splats of a step."""
+    rows, _, weights, gradients = zip(*moves, strict=True)
+    return torch.stack(rows, dim=1), torch.stack(weights, dim=1), torch.stack(gradients, dim=1)
+
+
 def sums_by_autograd(
-    pixel: PixelKernel, limits: Limits, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], pixels: Pixels
+    pixel: PixelKernel, limits: Limits, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]]
 ) -> Float[Tensor, "t c_K"]:
     """Gradient of the raster rows for any pixel kernel: autograd of alpha, from the gradient of log alpha."""
-    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
+    rows, weights, gradients = stacked(moves)
     with torch.enable_grad():
         rows = rows.detach().requires_grad_()
-        alpha = pixel.alpha(rows.transpose(0, 1), pixels, limits).transpose(0, 1)
+        alpha = pixel.alpha(rows.transpose(0, 1), moves[0].pixels, limits).transpose(0, 1)
         grads = torch.where(alpha > 0, gradients / alpha, 0.0).detach()
         (added,) = torch.autograd.grad(alpha, rows, grads)
     added[..., RED : BLUE + 1] = torch.bmm(weights, torch.stack([*colours], dim=2))

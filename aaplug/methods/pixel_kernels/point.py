@@ -23,7 +23,7 @@ from aaplug.core.kernels import Kernel, Kernels, backward_of
 from aaplug.core.projection import sum_of
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.gradients import Move
+from aaplug.methods.pixel_kernels.gradients import Move, stacked
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE, forms_at, splat_example
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
@@ -67,23 +67,21 @@ class Point:
         white = torch.einsum("cij,pcj->pci", whitening(splats), offsets)
         return torch.exp(-0.5 * white.square().sum(dim=2))
 
-    def sums(
-        self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t s_K"]:
+    def sums(self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor) -> Float[Tensor, "t s_K"]:
         """Per splat, sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
 
         With s the gradient of log alpha: s·u², s·u·v, s·v², s·u, s·v, s, and the compositing weight times the gradient
         of each channel.
         """
         if not torch.compiler.is_compiling():
-            sums = _sums_by_products(moves, colours, pixels)
+            sums = _sums_by_products(moves, colours)
             if self.gradient_sums > ALPHA_SUMS:
-                terms = [self.further_terms(row, gradient, forms_at(row, pixels)) for row, _, gradient in moves]
+                terms = [self.further_terms(row, gradient, forms_at(row, pixels)) for row, pixels, _, gradient in moves]
                 further = [torch.stack([x.sum(dim=1) for x in of_splat], dim=1) for of_splat in terms]
                 sums = torch.cat([sums, torch.stack(further, dim=1)], dim=2)
             return sums.flatten(1)
         sums = []
-        for row, weight, gradient in moves:
+        for row, pixels, weight, gradient in moves:
             # Both are 0 where T is 0, but the test on T makes the compiler fuse all sums into one loop.
             gradient, weight = (torch.where(T > 0, x, 0.0) for x in (gradient, weight))
             u, v = forms_at(row, pixels)
@@ -126,8 +124,9 @@ def exp2_of(h: Float[Tensor, "*any"], limits: Limits) -> Float[Tensor, "*any"]:
     and is left out.
     """
     if torch.compiler.is_compiling():
-        value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
-        return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, value, 0.0)
+        root = _polynomial(h, ROOT_OF_EXP2).pow(2 ** (SQUARINGS - 1))  # compiled to squarings
+        # the last squaring comes after the cut-off, so that 1 - alpha is one instruction with it
+        return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, root, 0.0).square()
     # The exponent is clamped, because subnormal numbers are slow.
     return limits.cut((h + LOG2_PADDING).clamp_(min=LOG2_PADDING).exp2_())
 
@@ -151,11 +150,9 @@ def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
     return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
 
 
-def _sums_by_products(
-    moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], pixels: Pixels
-) -> Float[Tensor, "t K s"]:
+def _sums_by_products(moves: list[Move], colours: Sequence[Float[Tensor, "t P"]]) -> Float[Tensor, "t K s"]:
     """The same sums, for eager mode: matrix products of moments about the tile's centre, to keep precision."""
-    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
+    pixels, (rows, weights, gradients) = moves[0].pixels, stacked(moves)
     x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
     monomials = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
     s, sx, sy, sxx, sxy, syy = (gradients @ monomials).unbind(dim=2)

@@ -24,6 +24,7 @@ MIN_LONG_LIST = 8  # rows of a tile, from which on the loop over rows, which wai
 
 UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10  # columns from here on are a kernel's own
+FORMS = ((UX, UY), (VX, VY))  # columns of the factors of x and y in u and v
 
 
 def rows_of(splats: Splats2D, forms: Sequence[Tensor], more: Sequence[Tensor]) -> Float[Tensor, "m c"]:
@@ -46,25 +47,36 @@ def tile_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]
 
 def forms_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """The two linear forms of splats at pixel centres."""
-    forms = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
+    at_corners = pixels.at_corners or forms_at_corners(row, pixels.corners)
+    forms = [(row[..., i], row[..., j], k) for (i, j), k in zip(FORMS, at_corners, strict=True)]
     if torch.compiler.is_compiling():
-        dx, dy = offsets_at(row, pixels)
-        u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in forms)
+        columns = [[x[..., None] for x in form] for form in forms]
+        u, v = (torch.addcmul(torch.addcmul(k, j, pixels.y), i, pixels.x) for i, j, k in columns)
     else:  # eagerly a matrix product is faster than any operation per pixel
         basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
-        x, y = _from_corner(row, pixels)
-        u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in forms)
+        u, v = (torch.stack(form, dim=-1) @ basis for form in forms)
+    return u, v
+
+
+def forms_at_corners(
+    row: Float[Tensor, "*n t c"], corners: Float[Tensor, "t _"]
+) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
+    """The two linear forms of splats at their tiles' corners."""
+    x, y = _from_corner(row, corners)
+    u, v = (-(row[..., i] * x + row[..., j] * y) for i, j in FORMS)
     return u, v
 
 
 def offsets_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """Offset of pixel centres from splats, in px."""
-    x, y = _from_corner(row, pixels)
+    x, y = _from_corner(row, pixels.corners)
     return pixels.x - x[..., None], pixels.y - y[..., None]
 
 
-def _from_corner(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
-    return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+def _from_corner(
+    row: Float[Tensor, "*n t c"], corners: Float[Tensor, "t _"]
+) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
+    return row[..., X] - corners[:, 0], row[..., Y] - corners[:, 1]
 
 
 def next_rows(

@@ -172,14 +172,14 @@ def _step(
     before, passed = T, []
     pixels = Pixels(corners, *planes[-coordinates:])
     nearest = next_rows(rows, ids, lists[:, 0] + ahead_of_list, lists[:, 1], STEP)
-    for row, alpha in in_turn(pixel, limits, nearest, pixels):
+    for row, seen, alpha in in_turn(pixel, limits, nearest, pixels):
         through = transmitted(alpha, one, limits)
         after = before * through
         hides = where_above(limits.below_min_transmittance, after, one - through)
-        passed.append((row, alpha, hides, before))
+        passed.append((row, seen, alpha, hides, before))
         before = after
     moves, light = [], behind
-    for row, alpha, hides, reaching in reversed(passed):
+    for row, seen, alpha, hides, reaching in reversed(passed):
         weight = reaching * hides
         colour = g_hidden
         for i, gradient in enumerate(colours, start=RED):
@@ -187,13 +187,13 @@ def _step(
         ahead = less(colour, light, one)
         # The weight is 0 below the cut-off and after the stop.  At the cap alpha has no gradient.
         move = where_above(0.0, limits.max_alpha * one - alpha, weight) * ahead
-        moves.append(Move(row, weight, move))
+        moves.append(Move(row, seen, weight, move))
         light = light + hides * ahead
     light = one * light
     if isinstance(pixel, SumsGradients):
-        sums = pixel.sums(moves[::-1], colours, T, pixels)
+        sums = pixel.sums(moves[::-1], colours, T)
     else:
-        sums = sums_by_autograd(pixel, limits, moves[::-1], colours, pixels)
+        sums = sums_by_autograd(pixel, limits, moves[::-1], colours)
     left.copy_(light)
     parts.copy_(sums)
     return ()

@@ -1,6 +1,7 @@
 """Compositing, forward: front-to-back alpha compositing of all tiles at once, as array code that is compiled.
 
-Compiled, a pass gathers its raster rows in one loop and composites in one loop over tiles and pixels.
+Compiled, a pass gathers its raster rows in one loop, evaluates their forms at the tiles' corners in a second, and
+composites in one loop over tiles and pixels.
 
 t: tiles of a block; n: the first of t; P: pixels per tile; K: splats per pass or step; d: channels;
 m: raster rows; p: entries of `Bins.splats`; c: columns of a raster row.
@@ -19,10 +20,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels, ReadsRays
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, Kernel, Kernels, materialized
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, forms_at_corners, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
@@ -189,7 +190,7 @@ def _pass(
     before, left = T, []
     pixels = Pixels(corners, *planes[-coordinates:])
     nearest = next_rows(rows, ids, lists[:, 0] + ahead, lists[:, 1], pixel.splats_per_pass)
-    for row, alpha in in_turn(pixel, limits, nearest, pixels):
+    for row, _, alpha in in_turn(pixel, limits, nearest, pixels):
         after = before * transmitted(alpha, one, limits)
         weight = where_above(limits.below_min_transmittance, after, less(before, after, one))
         before = after
@@ -210,17 +211,19 @@ def coordinates_of(pixel: PixelKernel) -> int:
 
 def in_turn(
     pixel: PixelKernel, limits: Limits, rows: Float[Tensor, "t K c"], pixels: Pixels
-) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
-    """Raster row and alpha of each tile's k-th splat, for k = 0 … K - 1.
+) -> Iterator[tuple[Float[Tensor, "t c"], Pixels, Float[Tensor, "t P"]]]:
+    """Raster row, pixels and alpha of each tile's k-th splat, for k = 0 … K - 1.
 
     Eager code computes all alphas at once, a compiled loop each one where it is needed.
     """
     if torch.compiler.is_compiling():
-        for row in rows.unbind(dim=1):
-            yield row, pixel.alpha(row, pixels, limits)
+        at_corners = [materialized(form.T) for form in forms_at_corners(rows.transpose(0, 1), pixels.corners)]
+        for row, u, v in zip(*(x.unbind(dim=1) for x in (rows, *at_corners)), strict=True):
+            seen = pixels._replace(at_corners=(u, v))
+            yield row, seen, pixel.alpha(row, seen, limits)
     else:
         alphas = pixel.alpha(rows.transpose(0, 1), pixels, limits)
-        yield from zip(rows.unbind(dim=1), alphas.unbind(), strict=True)
+        yield from ((row, pixels, alpha) for row, alpha in zip(rows.unbind(dim=1), alphas.unbind(), strict=True))
 
 
 # Eager code costs one pass over memory per operation, and `where` costs most.  In a compiled loop, function calls and
@@ -231,7 +234,8 @@ def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], limits: 
     """1 - alpha, with alpha capped."""
     least = 1 - limits.max_alpha
     if torch.compiler.is_compiling():
-        return torch.relu(limits.max_alpha * one - alpha) + least
+        through = one - alpha  # the maximum of positive floats is that of their bits, an instruction less than `relu`
+        return torch.maximum(through.view(torch.int32), least.view(torch.int32)).view(torch.float32)
     return (one - alpha).clamp_(min=least)
 
 
