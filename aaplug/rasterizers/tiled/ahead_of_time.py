@@ -97,7 +97,7 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # Operations up to which inductor writes a value out again for each of its readers, where kernels are chained.
 CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
-# What profilers read, where torch knows these settings: three quarters of a package, and a tenth of the time to compile.
+# What only profilers read, where torch knows these settings: three quarters of a package, a tenth of compiling.
 FOR_PROFILERS = ("enable_frame_pointer", "enable_line_tables")
 THIS_PROCESSOR = "native"  # as g++ calls its architecture
 # g++'s options, of `Kernel.overlaps`; they follow the architecture, the only setting whose text reaches g++.

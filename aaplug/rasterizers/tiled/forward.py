@@ -87,9 +87,9 @@ def composite_forward(
     rows: raster rows; the last one is the padding row.
     """
     local = how.centres(rows)
-    planes = rows.new_zeros(how.channels + 1, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     filled = max(MIN_TILES, int((bins.counts > 0).sum()))
+    planes = rows.new_zeros(how.channels + 1, min(filled + 1, len(order)), PIXELS)  # all empty tiles share the last
     tiles = order[:filled].tensor_split(-(-filled // how.kernels.tiles)) if len(order) else ()
     done = 0
     for block in tiles:

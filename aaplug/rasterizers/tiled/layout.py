@@ -15,10 +15,14 @@ from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE
 
 
 def placed(
-    planes: Float[Tensor, "k t P"], order: Int[Tensor, " t"], columns: int, kernels: Kernels
+    planes: Float[Tensor, "k _ P"], order: Int[Tensor, " t"], columns: int, kernels: Kernels
 ) -> Float[Tensor, "k h w"]:
-    """Planes of an image of `columns` tiles a row.  order: which of the image's tiles each is."""
-    ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
+    """Planes of an image of `columns` tiles a row.
+
+    order: which of the image's tiles each is; those beyond the planes' equal their last tile.
+    """
+    places = torch.arange(len(order), device=order.device).clamp_(max=planes.shape[1] - 1)
+    ranks = torch.empty_like(order).index_copy_(0, order, places)
     lines = ranks.view(-1, 1, columns) * TILE + torch.arange(TILE, device=order.device)[:, None]
     return _gathered(planes.unbind(), lines, kernels).view(len(planes), -1, columns * TILE)
 
