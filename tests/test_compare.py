@@ -273,7 +273,9 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     with Path("out/compare.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 2 * 3 * 3  # scenes, scales, views
-    assert {row["compared scene"] for row in rows} == {"scene.ply", "dim.ply"}
+    assert {(row["scene"], row["compared scene"]) for row in rows} == {
+        ("scene.ply", name) for name in ("scene.ply", "dim.ply")
+    }
     page = Path("out/report.html").read_text()
     assert "aaplug comparison" in page
     assert "against the first scene" in page

@@ -94,7 +94,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             bounds = task.coverage(job.scene.gaussians())
             replaces = options.overwrite or options.resume
             data, table, sheet = COMPARED
-            texts = {data: as_json(comparison.summary()), table: as_csv({"compare": report})}
+            texts = {data: as_json(comparison.summary()), table: as_csv({rows[0].name: report})}
             files = write_texts(folder, texts, replaces)
             title = f"{rows[0].name} and {', '.join(scene.name for scene in rows[1:])}"
             files += write_page(folder, title, report, bounds, images, replaces, comparison.facts())
