@@ -21,6 +21,8 @@ from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene
 from aaplug.io.scenes.ply import EXTRAS
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.monitor import Monitor
+from aaplug.verbs.merge import merge
 
 QUICK = 0.5  # s, for a refusal
 NUMPY = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "short": "<i2", "int32": "<i4"}
@@ -218,6 +220,23 @@ def test_chosen_rows_keep_their_unknown_columns(tmp_path: Path, index: list[int]
     scene = read_scene(file.save(tmp_path)).gaussians()[torch.tensor(index, dtype=torch.int64)]
     expected = replace(file, count=str(len(index))).header + file.rows[index].tobytes()
     assert through(scene, tmp_path) == expected + file.after[1]
+
+
+def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):
+    """Columns and tables of the user's own are not lost without a word; normals and colours in bytes are no loss."""
+    own = replace(extended("label", "nx"), after=(box, bytes(range(10))))
+    usual = plain(columns=[*extended("nx", "ny", "nz").columns, *coloured().columns[3:6]])
+    said, lost = list[str](), "the columns label and the tables chunk"
+    monkeypatch.setattr(Monitor, "say", lambda self, text: said.append(text))
+    for name, file in {"own": own, "usual": usual}.items():
+        (tmp_path / f"{name}.ply").write_bytes(file.content)
+        scene = read_scene(tmp_path / f"{name}.ply").gaussians()
+        for suffix in ("glb", "copy.ply"):
+            write_scene(tmp_path / f"{name}.{suffix}", scene)
+        merge([scene], None, None)
+    warned = [message for message in caplog.messages if "cannot hold" in message]
+    assert warned == [f"{tmp_path / 'own.glb'}: the format cannot hold {lost}; a .ply can"]
+    assert said == [f"own.ply: the merged scene does not have its {lost.removeprefix('the ')}"]
 
 
 def test_fewer_harmonics_drop_their_columns(tmp_path: Path):

@@ -25,6 +25,7 @@ from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.columns import matrix_of
+from aaplug.io.scenes.ply import beside
 from aaplug.io.scenes.pyramid_folder import (
     MANIFEST,
     Level,
@@ -104,8 +105,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     if not job.cameras.assumed:
         check_frame(whole.means, job.cameras.train, whole.name, options.min_seen)
     job.say_assumed()
-    if whole.extras:
-        job.monitor.say(f"{whole.name}: merged Gaussians do not have its columns {', '.join(whole.extras)}")
+    if lost := beside(whole):
+        job.monitor.say(f"{whole.name}: merged Gaussians do not have its {lost}")
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:

@@ -18,6 +18,7 @@ from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import check_scene_output, scene_of, write_scene
 from aaplug.io.scenes.faults import check_values
 from aaplug.io.scenes.packed import of_degree
+from aaplug.io.scenes.ply import beside
 from aaplug.methods.conversion import carried
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions
@@ -71,9 +72,8 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
                 views = job.cameras.notes[0] if job.cameras.assumed else known
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")
                 part = carried(part, training, into)
-            if part.extras:
-                columns = ", ".join(part.extras)
-                options.monitor.say(f"{scene.title}: the merged scene does not have its columns {columns}")
+            if lost := beside(part):
+                options.monitor.say(f"{scene.title}: the merged scene does not have its {lost}")
             parts.append(replace(placed(part, turn, scale, move), extras={}, origin=None))
         degree, fused = max(part.sh_degree for part in parts), {str(f): f for part in parts for f in part.fused}
         merged = joined([replace(of_degree(part, degree), fused=tuple(fused.values())) for part in parts])

@@ -62,7 +62,7 @@ class WritableFormat(SceneFormat, Protocol):
     """A format that can be written too.  needs: a package that writing imports, or None.
 
     It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.  A format
-    whose files another one reads, names it as `read_as`.  One that writes the columns of `Gaussians.extras` has a true
+    whose files another one reads, names it as `read_as`.  One that writes what `ply.beside` names has a true
     `keeps_extras`; for others a warning names what is lost.
     """
 
@@ -219,8 +219,8 @@ def write_parts(
 def _storable(path: AnyPath, parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:
     """The parts as float32 on the CPU; raises OutputError for values that no renderer can use."""
     for place, part in enumerate(parts):
-        if part.extras and not keeps_extras and not place:
-            log.warning("%s: the format cannot hold the columns %s; a .ply can", path, ", ".join(part.extras))
+        if not place and not keeps_extras and (lost := ply.beside(part)):
+            log.warning("%s: the format cannot hold the %s; a .ply can", path, lost)
         part = replace(part, **{name: column.detach().cpu().float() for name, column in part.columns.items()})
         if faults := faults_of(part):
             raise OutputError(path, f"the scene to write cannot be used: {described_faults(faults)}")
