@@ -13,7 +13,7 @@ import torch
 
 from aaplug.core.cameras import Camera, CameraSet, centred, look_at
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.orbits import Frame, frame_of
+from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of
 from aaplug.core.orbits import orbit as orbit_views
 from aaplug.core.sampling import sampling_bounds
 from aaplug.io.cameras import holds_cameras
@@ -59,19 +59,34 @@ def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> Came
     cameras = CameraSet(train, _orbit_views(orbit, frame, train[0]), assumed=True)
     size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)
     note = f"{TRAINING_RATE}assumed as of {size} px from the orbit, {rate:.4g} px per unit in its middle ({reason})"
+    notes = (note, f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})")
     if path is not None and holds_cameras(path.parent):
-        return replace(cameras, notes=(note, f"there are cameras: --cameras {path.parent}"))
-    return replace(cameras, notes=(note,))
+        notes = (*notes, f"there are cameras: --cameras {path.parent}")
+    return replace(cameras, notes=notes)
 
 
 def frame_around(scene: Scene, orbit: Orbit, sample: Gaussians | None = None) -> Frame:
     """The frame of an orbit; raises UsageError as `cameras_around`.  sample: the scene's, if it is known."""
-    if orbit.up is not None:
-        up = orbit.up
-    else:  # what nerfstudio writes points up along z
-        comments = scene.document.header.comments if isinstance(scene.document, Document) else []
-        up = Z_UP if any(NERFSTUDIO.match(comment) for comment in comments) else None
+    up = orbit.up
+    if up is None and _by_nerfstudio(scene):
+        up = Z_UP
     return frame_of(scene.sample(PROBE_ROWS) if sample is None else sample, up)
+
+
+def up_evidence(scene: Scene, orbit: Orbit, frame: Frame) -> str:
+    """What the direction that points up in the frame rests on, in words."""
+    if orbit.up is not None:
+        return "--up"
+    if _by_nerfstudio(scene):
+        return "as nerfstudio wrote the file; --up changes it"
+    if frame.up.tolist() == [*DOWN_IS_Y]:
+        return "as nothing says; --up does"
+    return "as colours vary most seen from there; --up changes it"
+
+
+def _by_nerfstudio(scene: Scene) -> bool:
+    comments = scene.document.header.comments if isinstance(scene.document, Document) else []
+    return any(NERFSTUDIO.match(comment) for comment in comments)
 
 
 def _assumed_training(

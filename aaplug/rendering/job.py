@@ -177,7 +177,8 @@ class Job(Generic[O_co]):
         """
         if not self.cameras.assumed:
             return
-        for note in self.cameras.notes:
+        rate, *others = self.cameras.notes
+        for note in (*others, rate):
             self.monitor.say(note)
         if renderer is not None:
             decibels = decibels_at(renderer, view or self.cameras.test[0], (0.5, 2.0))

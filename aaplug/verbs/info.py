@@ -15,7 +15,7 @@ from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.conversion import describe
 from aaplug.options.shared import FrameOptions, Orbit
-from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of
+from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of, up_evidence
 from aaplug.rendering.job import CamerasLike, Job
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, counted
@@ -60,7 +60,8 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
     with job.monitor.progress("reading", "Gaussians") as tell:
         statistics = survey(opened, train, tell)
     if isinstance(orbit, Orbit):
-        sampling = _assumed_facts(statistics, job.cameras, frame_around(opened, orbit))
+        frame = frame_around(opened, orbit)
+        sampling = _assumed_facts(statistics, job.cameras, frame, up_evidence(opened, orbit, frame))
     else:
         sampling = _sampling_facts(statistics, job.cameras, opened.convention.kernel) if train else {}
         sampling |= _spectrum_facts(opened, train) if train else {}
@@ -114,7 +115,7 @@ def _spectrum_facts(scene: Scene, train: Sequence[Camera]) -> dict[str, Any]:
     return {"energy_above_nyquist_share": {n: found for n, found in shares.items() if None not in found.values()}}
 
 
-def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:
+def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame, evidence: str) -> dict[str, Any]:
     side = max(cameras.train[0].hw)
     shares = {size: statistics.multiples.share_below(math.log(side / size)) for size in PICTURE_SIDES}
     return {
@@ -123,6 +124,7 @@ def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict
         "centre": frame.centre.tolist(),
         "radius": frame.radius,
         "up": frame.up.tolist(),
+        "up_evidence": evidence,
         "surroundings_and_floaters_share": frame.outside,
         "below_a_pixel_share": {str(size): share for size, share in shares.items() if share is not None},
     }
