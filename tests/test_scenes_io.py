@@ -17,7 +17,7 @@ from plyfile import PlyData
 
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
-from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene
+from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene, written_format
 from aaplug.io.scenes.ply import EXTRAS
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
@@ -220,6 +220,21 @@ def test_chosen_rows_keep_their_unknown_columns(tmp_path: Path, index: list[int]
     scene = read_scene(file.save(tmp_path)).gaussians()[torch.tensor(index, dtype=torch.int64)]
     expected = replace(file, count=str(len(index))).header + file.rows[index].tobytes()
     assert through(scene, tmp_path) == expected + file.after[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "format"),
+    {
+        "sog": None,
+        "ply": None,
+        "a/glb": None,
+        "a.sog": "sog",
+        "meta.json": "meta.json",
+        "a.compressed.ply": "compressed.ply",
+    }.items(),
+)
+def test_a_name_without_suffix_is_a_folders(name: str, format: str | None):
+    assert getattr(written_format(name), "name", None) == format
 
 
 def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):

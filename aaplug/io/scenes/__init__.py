@@ -228,8 +228,10 @@ def _storable(path: AnyPath, parts: Iterable[Gaussians], keeps_extras: bool) -> 
 
 
 def written_format(path: AnyPath) -> WritableFormat | None:
-    """The format that writes files of this suffix; None if none does."""
+    """The format that writes files of this suffix; None if none does, or there is no suffix: a folder may be `sog`."""
     name = Path(path).name.lower()
+    if not Path(name).suffix:
+        return None
     named = [format for format in SCENE_FORMATS.values() if f".{name}".endswith("." + format.name)]
     found = max(named, key=lambda format: len(format.name), default=None)
     return found if isinstance(found, WritableFormat) else None
