@@ -470,6 +470,10 @@ def test_spz_streams_are_held_to_their_size(tmp_path: Path):
         (tmp_path / "a.spz").write_bytes(data)
         with pytest.raises(FormatError, match=r"lists a stream|announce"):
             read_scene(tmp_path / "a.spz").gaussians()
+    whole = (DATA / "oracle_v4.spz").read_bytes()
+    (tmp_path / "a.spz").write_bytes(whole[:-1])
+    with pytest.raises(FormatError, match=f"is cut short: {len(whole):,} bytes promised, {len(whole) - 1:,} there"):
+        read_scene(tmp_path / "a.spz").gaussians()
 
 
 @pytest.mark.parametrize("level", [0, 2])

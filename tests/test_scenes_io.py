@@ -1,9 +1,11 @@
 """Scene files are read and written without loss, and damaged ones end in one line of error."""
 
+import gzip
 import logging
 import random
 import re
 import time
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -710,11 +712,16 @@ def test_dropped_rows_are_counted_aloud_and_stay_dropped(tmp_path: Path, caplog:
         ("empty.ply", "is empty"),
         ("junk.ply", r"no known scene format; aaplug reads \.compressed\.ply, \.ply, \.spz"),
         ("nul\0.ply", "cannot be read"),
+        ("scene.zip", "is an archive without meta.json, which a .sog has; if a scene's file is in it, unpack it"),
+        ("scene.ply.gz", "is an archive; unpack it, and name the scene's file"),
     ],
 )
 def test_what_is_no_scene_file_is_refused(tmp_path: Path, name: str, problem: str):
     (tmp_path / "empty.ply").touch()
     (tmp_path / "junk.ply").write_bytes(b"junk")
+    (tmp_path / "scene.ply.gz").write_bytes(gzip.compress(File().content))
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        archive.writestr("scene.ply", File().content)
     with pytest.raises(FormatError, match=problem):
         read_scene(tmp_path / name).gaussians()
     assert len(read_scene(File().save(tmp_path).rename(tmp_path / "scene.dat")).gaussians()) == 5, "told by content"

@@ -156,6 +156,8 @@ def read_scene(
     if format is None and (path.name in STREAM_INDEXES.values() or path.suffix.lower() == RAD_SUFFIX):
         raise FormatError(path, "holds levels for another viewer; name the scene that they were made of")
     if format is None:
+        if head.startswith((sog.ZIP_SIGNATURE, spz.GZIP_SIGNATURE)):
+            raise FormatError(path, "is an archive; unpack it, and name the scene's file that was in it")
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
     scene = replace(format.open_scene(path, options), drop_bad=drop_bad)

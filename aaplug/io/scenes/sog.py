@@ -114,6 +114,9 @@ def _from_folder(path: Path, file: str, most: int) -> bytes:
 
 def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> bytes:
     inside = [i for i in archive.infolist() if i.filename.rpartition("/")[2] == file]
+    if not inside and file == META:
+        what = f"is an archive without {META}, which a .sog has"
+        raise FormatError(path, f"{what}; if a scene's file is in it, unpack it and name that file")
     if len(inside) != 1:
         raise FormatError(path, f"should hold {file} once, and holds it {len(inside)} times")
     check_growth(path, inside[0].file_size, inside[0].compress_size)

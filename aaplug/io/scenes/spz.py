@@ -204,9 +204,10 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[list[bytes], by
             sections.append(b"")
             continue
         compressed, inflated = next(listed)
-        if inflated != size or at + compressed > len(data):
-            what = f"lists a stream of {compressed:,} bytes for {inflated:,}"
-            raise FormatError(path, f"{what}; {size:,} expected, and {len(data) - at:,} bytes are left")
+        if inflated != size:
+            raise FormatError(path, f"lists a stream that inflates to {inflated:,} bytes, {size:,} expected")
+        if at + compressed > len(data):
+            raise FormatError(path, f"is cut short: {at + compressed:,} bytes promised, {len(data):,} there")
         decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
         with decompressor.stream_reader(io.BytesIO(data[at : at + compressed])) as stream:
             section = stream.read(size + 1)
