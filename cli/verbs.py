@@ -26,7 +26,7 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import VERBS, Answer, Command, Option, Words, json_of, output
+from .words import VERBS, Answer, Command, Option, Words, json_of, options_of, output, worded
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted(HERE.glob("../examples/guides/*.md"))}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
+NOTED: dict[str, type[Options]] = {"notes": FileOptions, "cameras": CameraOptions}  # of `info`, which name parameters
 WRITTEN = (
     "File to write: .ply; .compressed.ply, .sog, .spz, .glb, .gltf, .usda, .usdc, .usdz or .splat, which keep less "
     "(see `aaplug guide formats`)"
@@ -293,7 +294,9 @@ def info(words: Words) -> Answer:
     facts = aaplug.info(*inputs, **told(words, FrameOptions))
     shown = {key: value for key, value in facts.items() if key not in PROGRAM_KEYS and value != []}
     names = [key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ") for key in shown]
-    return Answer(facts, [table(zip(names, map(_text, shown.values()), strict=True))])
+    options = {key: options_of(NOTED[key]) for key in shown if key in NOTED}
+    texts = [worded(_text(value), options.get(key, ())) for key, value in shown.items()]
+    return Answer(facts, [table(zip(names, texts, strict=True))])
 
 
 def _text(value: Any) -> str:

@@ -48,11 +48,11 @@ def test_what_cannot_be_fused_is_refused(cameras):
     training = TrainingViews.of(scene, cameras)
     with pytest.raises(UsageError, match="needs the training cameras"):
         fuse(scene, None, FORMS["matched-energy"])
-    with pytest.raises(UsageError, match="nothing to fuse"):
+    with pytest.raises(UsageError, match="nothing to fuse; `aaplug merge` of it alone changes the format"):
         fuse(replace(scene, convention=MIP), training, FORMS["matched-energy"])  # without a stored filter
     converted = fuse(scene, training, FORMS["matched-energy"])
     for form in FORMS.values():
-        with pytest.raises(UsageError, match="already has matched-energy"):
+        with pytest.raises(UsageError, match=r"already has matched-energy.*; `aaplug merge` of it alone"):
             fuse(converted, training, form)
 
 

@@ -35,6 +35,7 @@ class Form:
 
 MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
 MIP_SPLATTING = Form(Smoothing3D(), uses_bounds=True)
+MERGE_ALONE = "`aaplug merge` of it alone changes the format"
 FORMS = {"matched-energy": MATCHED_ENERGY, "mip-splatting": MIP_SPLATTING}
 
 
@@ -51,7 +52,8 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
         _check_discs(scene)
     _check_unblurred(scene)
     if form.skips == scene.convention and scene.filter_3d is None:
-        raise UsageError(scene.name, "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse")
+        problem = "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse"
+        raise UsageError(scene.name, f"{problem}; {MERGE_ALONE}")
     if scene.filter_3d is not None:
         converted = fuse_stored(scene)
     elif training is None:
@@ -120,4 +122,5 @@ def _check_discs(scene: Gaussians) -> None:
 def _check_unblurred(scene: Gaussians) -> None:
     if blurs := blurring(scene.fused):
         done = "; ".join(map(describe, blurs))
-        raise UsageError(scene.name, f"already has {done} fused; converting it again would blur it twice")
+        problem = f"already has {done} fused; converting it again would blur it twice"
+        raise UsageError(scene.name, f"{problem}; {MERGE_ALONE}")
