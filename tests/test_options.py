@@ -60,7 +60,8 @@ def test_values_stand_between_commas_with_or_without_spaces():
 def test_every_number_has_a_range(group, name, specs):
     assert len(specs) == 1, f"{group.__name__}.{name} has no range"
     (spec,) = specs
-    least, most = map(float, spec.takes.removesuffix(" ...").split(".."))
+    span = spec.takes.removesuffix(" ...").rpartition("each ")[2].removeprefix("a whole number ")
+    least, most = map(float, span.split(".."))
     several = spec.count is None
     for value in NO_NUMBERS:
         inside = isinstance(value, (int, float)) and value is not True and least <= value <= most
@@ -103,13 +104,16 @@ REFUSED = {
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
     "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",
     "finetune s.ply -o t.ply --learn-filters --method group-training": "is a method of its own, beside group-training",
-    "render s.ply -o out --threads 99999": "--threads: takes 1..",
+    "render s.ply -o out --threads 99999": "--threads: takes a whole number 1..",
+    "render s.ply -o out --orbit 2.5": "--orbit: takes a whole number 1..10000, got 2.5",
+    "render s.ply -o out --up z": "--up: takes X Y Z, each -10000000..10000000, got z",
+    "merge s.ply -o m.ply --move 1,a,2": "--move: takes X,Y,Z ..., each -1000000000..1000000000, got 1,a,2",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
     "evaluate s.ply -o out --show 5": "--show: selects views of the report; give --report, too",
     "compare a.ply b.ply --fail-under 500": "--fail-under: takes 0..200, got 500",
     "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
-    "bench --gaussians 1e5": "takes 1..100000000 ..., got 1e5",
+    "bench --gaussians 1e5": "takes N ..., each a whole number 1..100000000, got 1e5",
     "bench --gaussians 10 --resolution 0x0": "--resolution: takes sizes such as 400x400, got 0x0",
     "bench --gaussians 10 --resolution 1000000x1000000": "the limit is 16384 a side",
     "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",

@@ -157,9 +157,12 @@ def number(
             raise ValueError(word)
         return float(above) / (float(below) if slash else 1.0) / (100.0 if word.endswith("%") else 1.0)
 
-    takes = f"{least:.10g}..{most:.10g}" + " ..." * several
+    span = f"{least:.10g}..{most:.10g}"
+    shown = metavar or span + " ..." * several
+    named = f"{metavar}, each " * bool(several and metavar)  # such as X Y Z
+    takes = f"{named}{'a whole number ' * whole}{span}" + " ..." * (several and not named)
     how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "whole": whole}
-    return Number(metavar=metavar or takes, least=least, most=most, **how)
+    return Number(metavar=shown, least=least, most=most, **how)
 
 
 @dataclass(frozen=True, kw_only=True)
