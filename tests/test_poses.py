@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -81,8 +82,10 @@ def test_coarse_scales_lead_farther_than_fine_ones(photographed):
 def test_a_view_without_a_photograph_is_named(photographed):
     scene, cameras = photographed
     bare = CameraSet((replace(cameras.train[0], photo=None),), ())
-    with pytest.raises(aaplug.UsageError, match="view0: has no photograph"):
-        aaplug.refine_poses(scene, bare, min_seen=0.0)
+    tune = partial(aaplug.finetune, poses=True, truth="self", steps=1, rasterizer="eager")
+    for refines in (aaplug.refine_poses, tune):
+        with pytest.raises(aaplug.UsageError, match=r"^view0: has no photograph, on which its pose is refined$"):
+            refines(scene, bare, min_seen=0.0)
 
 
 def test_evaluate_tells_errors_of_poses_from_others(photographed):

@@ -5,7 +5,6 @@ from dataclasses import replace
 from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.evaluation.truth import source_of
 from aaplug.finetuning.poses import RefinedPose, refine_pose
 from aaplug.io.scenes import SceneLike
 from aaplug.methods.recipes import find_recipe
@@ -47,7 +46,8 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
 
     Raises UsageError if a view has no photograph.
     """
-    source_of(views, "photographs")
+    if bare := [view.name for view in views if view.photo is None]:
+        raise UsageError(bare[0], "has no photograph, on which its pose is refined")
     renderer, poses = look.by(find_recipe("auto", quality="fast")), []
     with job.monitor.progress("refining poses", "views") as tell:
         for done, view in enumerate(views):
