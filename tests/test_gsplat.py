@@ -880,12 +880,14 @@ def test_what_is_wrong_or_not_supported_is_said(message):
     assert str(error.value).startswith(message)
 
 
-def test_compiled_is_never_eager_without_a_word(monkeypatch):
+@pytest.mark.parametrize(("dtype", "later"), [(F64, ""), (torch.float32, ", and compiles it meanwhile")])
+def test_compiled_is_never_eager_without_a_word(monkeypatch, dtype, later):
     monkeypatch.setattr("aaplug.gsplat.choice.find_rasterizer", lambda name, frames: Tiled(EAGER))
     monkeypatch.setattr("aaplug.gsplat.drop_in.rasterizer_of", rasterizer_of.__wrapped__)
-    with pytest.raises(UsageError, match=r"^rasterizer: no kernel 'composite-point.*' is compiled for float64 \["):
-        rasterization(**gaussians(), **two_views(), rasterizer="compiled")
-    rasterization(**gaussians(), **two_views(), rasterizer="auto")
+    call, problem = gaussians(dtype=dtype) | two_views(dtype), f"is compiled for {str(dtype)[6:]} "
+    with pytest.raises(UsageError, match=rf"^rasterizer: no kernel 'composite-point' {problem}.*\beagerly{later}$"):
+        rasterization(**call, rasterizer="compiled")
+    rasterization(**call, rasterizer="auto")
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,14 @@
 from dataclasses import replace
 from functools import cache
 
+import torch
 from torch import Tensor
 
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernel, Kernels, Runner
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rasterizers.tiled import Tiled
+from aaplug.rasterizers.tiled.on_demand import BUILT_BY_NAME
 from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError
 
@@ -35,5 +37,6 @@ class OnlyCompiled(Kernels):
         whole = all(len(arg) > 1 for arg in args if arg.dim())
         if run is kernel.function and kernel.name.startswith("composite-") and whole:
             problem = f"no kernel '{kernel.name}' is compiled for {described(args[0])}"
-            raise UsageError("rasterizer", f'{problem}; "auto" draws it eagerly where "compiled" cannot')
+            later = ", and compiles it meanwhile" * (kernel.name in BUILT_BY_NAME and args[0].dtype is torch.float32)
+            raise UsageError("rasterizer", f'{problem}; "auto" draws it eagerly{later}')
         return run
