@@ -52,6 +52,15 @@ def test_cameras_are_equal_by_value(field):
     assert view != "view"
 
 
+def test_a_printed_scene_says_what_it_is_and_leaves_out_what_its_writer_needs(tmp_path):
+    write_scene(tmp_path / "scene.ply", make_scene(6))
+    scene = read_scene(tmp_path / "scene.ply")
+    for printed in (repr(scene), repr(scene.gaussians())):
+        assert "scene.ply" in printed
+        assert "convention=" in printed
+        assert "f_dc_0" not in printed
+
+
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
 @pytest.mark.parametrize("held", [SCENE, PYRAMID, "file"], ids=["Gaussians", "levels", "file"])
 def test_a_copy_of_a_scene_holds_its_rows_and_equals_itself_alone(held, copied, tmp_path):

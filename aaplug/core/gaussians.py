@@ -49,7 +49,7 @@ class Origin:
     path: str
     format: str
     evidence: str
-    document: Any
+    document: Any = field(repr=False)
     rows: Int[Tensor, " n"]
 
 

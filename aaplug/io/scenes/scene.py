@@ -69,16 +69,16 @@ class Scene:
     format: str
     count: int
     sh_degree: int
-    load: Callable[[int, int], Gaussians]
+    load: Callable[[int, int], Gaussians] = field(repr=False)
     evidence: str
     convention: Convention = CLASSIC
     fused: tuple[Fusion, ...] = ()
     flat: bool = False
-    document: Any = None
+    document: Any = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
     other: "Scene | None" = None
     folder: Path | None = None
-    read_levels: Callable[[Path], Pyramid] | None = None
+    read_levels: Callable[[Path], Pyramid] | None = field(default=None, repr=False)
     frames: "SceneFrames | None" = None
     others: tuple[Path, ...] = ()
     drop_bad: bool = False
