@@ -79,6 +79,24 @@ def test_coarse_scales_lead_farther_than_fine_ones(photographed):
     assert apart(coarse_to_fine, cameras.train[0])[0] < apart(fine, cameras.train[0])[0] / 2
 
 
+def test_a_move_that_makes_up_for_aliasing_is_no_gain(tmp_path):
+    """At the training size, a square wall of small Gaussians has a sharp edge, which a smaller render misplaces."""
+    side = torch.linspace(-0.6, 0.6, 20)
+    x, z = torch.meshgrid(side, side, indexing="ij")
+    scene, view = make_scene(x.numel(), degree=0), make_camera((0.5, -4.0, 0.4), size=(16, 16))
+    scene = replace(
+        scene,
+        means=torch.stack([x, torch.zeros_like(x), z], dim=2).flatten(0, 1),
+        log_scales=torch.full_like(scene.log_scales, -2.8),
+        logit_opacities=torch.full_like(scene.logit_opacities, 6.0),
+        sh=torch.full_like(scene.sh, 1.5),
+    )
+    renderer = Renderer.of(scene, [view], min_seen=0.0)
+    write_png(tmp_path / "wall.png", renderer(view).rgb.clamp(0, 1))
+    found = refine_pose(renderer, replace(view, photo=tmp_path / "wall.png"), (1 / 2,))
+    assert (found.degrees, found.distance) == (0.0, 0.0)
+
+
 def test_a_view_without_a_photograph_is_named(photographed):
     scene, cameras = photographed
     bare = CameraSet((replace(cameras.train[0], photo=None),), ())

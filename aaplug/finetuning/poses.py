@@ -24,14 +24,14 @@ SCALES = (1 / 8, 1 / 4, 1 / 2)  # of the training size
 ITERATIONS = 16  # of L-BFGS at each scale, at most
 LEVELS = 255.0  # of 8 bits: errors are in squared levels
 LEAST_CHANGE = 1e-3  # px by which a step moves the camera, or squared levels by which the error falls: a scale ends
-LEAST_GAIN = 0.05  # share by which the squared error must fall: at right poses, errors of the scene give 0.025
+LEAST_GAIN = 0.05  # share by which the squared error must fall at the training size
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
     """A camera, the angle by which it was turned, and the distance by which it was moved, in world units.
 
-    before, after: root mean square error against the photograph at half the training size, in 8-bit levels.
+    before, after: root mean square error against the photograph at the training size, in 8-bit levels.
     """
 
     camera: Camera
@@ -44,7 +44,8 @@ class RefinedPose:
 def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCALES) -> RefinedPose:
     """Move a view, given at its training size, until its render looks like its photograph.
 
-    The view stays where it is if its error falls by less than `LEAST_GAIN`.
+    The view stays where it is if its error at the training size falls by less than `LEAST_GAIN`.  There the scene looks
+    as training drew it; in smaller renders, a move may only make up for what aliasing does.
     """
     camera, depth = view, median_depth(renderer.scene.means, view)
 
@@ -64,6 +65,7 @@ def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCAL
         how = {"max_iter": ITERATIONS, "tolerance_grad": 0.0, "tolerance_change": LEAST_CHANGE}
         torch.optim.LBFGS([px], **how, line_search_fn="strong_wolfe").step(closure)
         camera = moved_by(camera, px.detach() / focal, depth)
+    scale, photo = 1.0, photo_at(view, view, renderer.background)
     with torch.no_grad():
         before, after = float(error(view)), float(error(camera))
     if after > (1 - LEAST_GAIN) * before:

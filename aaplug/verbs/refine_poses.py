@@ -61,6 +61,6 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
     if changed:
         turn, shift, before, after = map(median, zip(*changed, strict=True))
         moves = f"{len(changed)} of {count} moved, in the median by {turn:.2g}° and {shift:.2g} units"
-        note = f"{moves}: error at half size from {before:.1f} to {after:.1f} of 255 levels"
+        note = f"{moves}: error at the training size from {before:.1f} to {after:.1f} of 255 levels"
     job.monitor.say(note)
     return replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses)
