@@ -1,24 +1,40 @@
 """A package that is not part of aaplug adds one of everything: the steps of examples/guides/contributing.md."""
 
 import json
+import math
 import os
 import re
 import shlex
 import subprocess
 import sys
 import tomllib
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import Colour
+from aaplug.core.splats import Render
 from aaplug.evaluation import METRICS
+from aaplug.evaluation.laws.base import make_camera, make_scene
+from aaplug.finetuning import LOSSES
+from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
 from aaplug.io.images import image_size
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes import SCENE_FORMATS, read_scene, write_scene
+from aaplug.lab.gaussian_blending import GaussianBlending
+from aaplug.methods.pixel_kernels.point import Point
+from aaplug.methods.recipe import Recipe
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import PlugInError, UsageError
 from aaplug.verbs.check_plugin import check_plugin
+from aaplug.verbs.evaluate import evaluate
+from aaplug.verbs.finetune import finetune
 from tests.conftest import SAMPLE
 from tests.test_documented import GAUSSIANS, few, write_cameras
 
@@ -37,6 +53,7 @@ for words in json.loads(sys.argv[1]):
 """
 FILES = {path.name for path in (PLUGIN / "stranger").glob("[!_]*.py")}
 GROUPS = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]
+CAMERAS = CameraSet((make_camera(size=(16, 12)),), (make_camera(size=(16, 12)),))
 LOOK = "{name} 40 30 50  {x} -4 1  0 0 0  {held_out}\n"  # see camera_format.py
 
 
@@ -140,3 +157,176 @@ def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(monkeypa
     [verdict] = check_plugin("imports")
     assert (verdict.kind, verdict.name) == ("metric", "odd")
     assert verdict.problem.startswith("metric odd: gives no number but Tensor")
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """A filter, kernel, compositor, rasterizer and format whose answer to everything is that of `answers`."""
+
+    answers: Callable[..., Any]
+    name: str = "wrong"
+    sign: str = ""
+    needs: None = None
+
+    def __call__(self, *given: Any) -> Any:
+        return self.answers(*given)
+
+    def sniff(self, path: Path, *_: Any) -> bool:
+        return path.suffix == ".wrong"
+
+    open_scene = read = write = __call__
+
+
+@dataclass(frozen=True)
+class WrongKernel(Point):
+    name: str = "wrong"
+    answers: Callable[..., Any] = max
+
+    def alpha(self, *given: Any) -> Any:
+        return self.answers(super().alpha(*given))
+
+
+@dataclass(frozen=True)
+class WrongCompositor(GaussianBlending):
+    name: str = "wrong"
+    answers: Callable[..., Any] = max
+
+    def tiles(self, *given: Any) -> Any:
+        return self.answers(super().tiles(*given))
+
+
+def fails(*given: Any) -> Any:
+    raise KeyError("key")
+
+
+def spoils(thing: Any, *_: Any) -> Any:
+    """Writes to its input."""
+    value = thing if isinstance(thing, torch.Tensor) else next(x for x in vars(thing).values() if x is not None)
+    value.mul_(1)
+    return thing
+
+
+def drawn(**parts: Any) -> None:
+    rasterizer = parts.pop("rasterizer", "eager")
+    recipe = Recipe("theirs", **{"screen": lambda splats, camera, training: splats, **parts}, source="", when="")
+    Renderer.of(make_scene(20), CAMERAS, recipe, rasterizer=rasterizer)(CAMERAS.test[0])
+
+
+def by(part: str) -> Callable[..., None]:
+    return lambda answers, *_: drawn(**{part: Wrong(answers)})
+
+
+def evaluated(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, *_: Any) -> None:
+    metric = replace(METRICS["PSNR"], name="wrong", measure=answers)
+    monkeypatch.setitem(METRICS._entries, "wrong", metric)
+    evaluate(make_scene(20), CAMERAS, metric="wrong", recipe="classic", scale=(0.5,), rasterizer="eager")
+
+
+def tuned(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setitem(LOSSES._entries, "wrong", answers)
+    finetune(make_scene(20), CAMERAS, folder / "tuned.ply", loss="wrong", steps=1, rasterizer="eager")
+
+
+def opened(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setitem(SCENE_FORMATS._entries, "wrong", Wrong(answers))
+    (folder / "scene.wrong").write_text("x")
+    read_scene(folder / "scene.wrong").gaussians()
+
+
+def written(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setitem(SCENE_FORMATS._entries, "wrong", Wrong(answers))
+    write_scene(folder / "scene.wrong", make_scene(3))
+
+
+def cameras_read(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setitem(CAMERA_FORMATS._entries, "wrong", Wrong(answers))
+    (folder / "views.wrong").write_text("x")
+    read_cameras(folder / "views.wrong")
+
+
+VERBS = {
+    "screen filter wrong": by("screen"),
+    "world filter wrong": by("world"),
+    "rasterizer wrong": by("rasterizer"),
+    "pixel kernel wrong": lambda answers, *_: drawn(pixel=WrongKernel(answers=answers)),
+    "compositor wrong": lambda answers, *_: drawn(compositor=WrongCompositor(answers=answers)),
+    "metric wrong": evaluated,
+    "loss wrong": tuned,
+    "scene format wrong": opened,
+    "writing scene format wrong": written,
+    "camera format wrong": cameras_read,
+}
+NAN = "expected finite numbers, got"
+MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
+    **{(where, "raises"): (fails, "KeyError: 'key', in line") for where in VERBS},
+    ("screen filter wrong", "returns nothing"): (lambda *_: None, "should return a Splats2D, got None"),
+    ("screen filter wrong", "spoils"): (spoils, "changes its input: means"),
+    ("screen filter wrong", "builds"): (
+        lambda splats, *_: splats.blurred("x"),
+        "fails with variance: expected a number or a tensor [m] of float32 or float64, got 'x', in line",
+    ),
+    ("screen filter wrong", "precision"): (
+        lambda splats, *_: replace(splats, covs=splats.covs.double()),
+        "covs: expected float32 [20, 3], as given, got float64 [20, 3]",
+    ),
+    ("screen filter wrong", "nan"): (
+        lambda splats, *_: replace(splats, opacities=splats.opacities * math.nan),
+        f"opacities: {NAN} 20 of 20 that are NaN or infinite",
+    ),
+    ("world filter wrong", "fewer"): (
+        lambda scene, _: scene[:3],
+        "means: expected float32 [20, 3], as given, got float32 [3, 3]",
+    ),
+    ("rasterizer wrong", "shape"): (
+        lambda *_: Render(torch.zeros(16, 12, 3), torch.zeros(16, 12)),
+        "rgb: expected [12, 16, 3], got [16, 12, 3]",
+    ),
+    ("rasterizer wrong", "tuple"): (
+        lambda *_: (torch.zeros(12, 16, 3), 1),
+        "should return a Render, got a tuple of float32 [12, 16, 3], 1",
+    ),
+    ("pixel kernel wrong", "shape"): (lambda alpha: alpha[..., 1:], "fails with RuntimeError"),
+    ("pixel kernel wrong", "nan"): (lambda alpha: alpha * math.nan, f"rgb: {NAN} some"),
+    ("compositor wrong", "returns nothing"): (lambda _: None, "fails with"),
+    ("metric wrong", "spoils"): (lambda image, truth: spoils(image).sum(), "changes its input: argument 1"),
+    ("metric wrong", "stops"): (lambda image, truth: next(iter(())), "StopIteration"),
+    ("loss wrong", "shape"): (lambda image, truth: image, "should return a tensor [] of float32 or float64"),
+    ("loss wrong", "no gradient"): (lambda image, truth: image.detach().mean(), "gradient"),
+    ("scene format wrong", "returns nothing"): (lambda *_: None, "should return a Scene, got None"),
+    ("writing scene format wrong", "writes nothing"): (lambda *_: None, "has not written"),
+    ("camera format wrong", "returns a list"): (lambda *_: [make_camera()], "CameraSet, got a list of a Camera"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES, ids=", ".join)
+def test_a_plug_in_that_fails_in_a_verb_is_named(case, monkeypatch, tmp_path):
+    where, (answers, problem) = case[0], MISTAKES[case]
+    with pytest.raises(PlugInError) as caught:
+        VERBS[where](answers, monkeypatch, tmp_path)
+    assert caught.value.where == where.removeprefix("writing ")
+    assert problem in caught.value.problem
+    if case[1] == "raises":
+        assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
+    def refuses(*_: Any) -> Any:
+        raise UsageError("scale", "is not for this metric")
+
+    with pytest.raises(UsageError, match=r"^scale: is not for this metric$"):
+        evaluated(refuses, monkeypatch, tmp_path)
+
+
+def test_an_import_that_ends_the_program_is_told(tmp_path, monkeypatch):
+    (tmp_path / "ends_here.py").write_text("\nraise SystemExit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UsageError, match=r"cannot be imported: SystemExit: 3, in line 2 of ends_here.py"):
+        check_plugin("ends_here")
+
+
+def test_a_broken_law_shows_where_it_raises(monkeypatch):
+    module = ModuleType("tests")
+    module.RAISES = replace(METRICS["PSNR"], name="odd", measure=fails)  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "tests", module)
+    [verdict] = check_plugin("tests")
+    assert re.fullmatch(r"KeyError: 'key', in line \d+ of test_plugin.py", verdict.problem)

@@ -20,7 +20,8 @@ from aaplug.evaluation.protocols import Protocol
 from aaplug.io.atomic import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import check_fields
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import PlugInError, UsageError
+from aaplug.system.plug_ins import asked, check_answer
 
 Image = Float[Tensor, "h w 3"]
 LpipsFiles = tuple[AnyPath, AnyPath]  # of the trunk and of the heads
@@ -135,13 +136,21 @@ class Metric:
         if (self.measure is None) == (self.figure is None):
             raise UsageError(f"metric {self.name}", "needs either `measure` or `figure`")
 
+    def prepared(self, protocol: Protocol, lpips_weights: LpipsFiles | None) -> "Metric":
+        """The metric as a protocol asks for it; see `prepare`."""
+        if self.prepare is None:
+            return self
+        metric = asked("metric", self, "prepare", protocol, lpips_weights)
+        check_answer(f"`prepare` of metric {self.name}", metric, Metric)
+        return metric
+
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""
-        return self._number(self.measure(image, truth)) if self.measure else None
+        return self._number(asked("metric", self, "measure", image, truth)) if self.measure else None
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""
-        return self._number(self.figure(series)) if self.figure else None
+        return self._number(asked("metric", self, "figure", series)) if self.figure else None
 
     def _number(self, value: Any) -> float | None:
         try:
@@ -149,7 +158,7 @@ class Metric:
                 raise TypeError("text")
             number = None if value is None else float(value.detach() if isinstance(value, Tensor) else value)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise UsageError(f"metric {self.name}", f"gives no number but {type(value).__name__}: {error}") from error
+            raise PlugInError(f"metric {self.name}", f"gives no number but {type(value).__name__}: {error}") from error
         return number if number is not None and math.isfinite(number) else None
 
     @property

@@ -190,7 +190,7 @@ def find_metrics(
     if len(set(metrics)) != len(metrics):
         raise UsageError("metric", "a metric is named twice")
     protocol = replace(protocol, **{name: flavour for name, _, flavour in parts if flavour})
-    return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in metrics]
+    return [metric.prepared(protocol, lpips_weights) for metric in metrics]
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:

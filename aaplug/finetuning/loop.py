@@ -20,7 +20,8 @@ from aaplug.finetuning.settings import SEED_STRIDE, Settings
 from aaplug.finetuning.state import State, TuningJob, snapshot, state_of
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.cores import on_free_cores
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import PlugInError, UsageError
+from aaplug.system.plug_ins import asked, blaming
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
 MAX_LOGIT = 9.0  # largest opacity logit: opacity 0.9999, where the sigmoid's gradient is nearly 0
@@ -79,7 +80,7 @@ def advance(job: TuningJob, state: State) -> None:
         losses = {}
         for scale, weight in weights.items():
             loss, drawing = loss_at(job, state, view, scale)
-            with on_free_cores():
+            with on_free_cores(), blaming(*state.renderer(job).recipe.parts, ("loss", LOSSES[settings.loss])):
                 (weight * loss).backward()
             losses[scale] = loss.item()
             if drawings is not None:
@@ -112,7 +113,11 @@ def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[F
     if drawing.splats.means.requires_grad:
         drawing.splats.means.retain_grad()
     image = drawing.render.rgb
-    return LOSSES[job.settings.loss](image, truth.to(image)), drawing
+    name = job.settings.loss
+    loss = asked("loss", LOSSES[name], "__call__", image, truth.to(image))
+    if image.requires_grad and not loss.requires_grad:
+        raise PlugInError(f"loss {name}", "should have a gradient in the image, got none")
+    return loss, drawing
 
 
 @torch.no_grad()

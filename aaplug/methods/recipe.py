@@ -88,6 +88,11 @@ class Recipe:
         check_fields(self)
 
     @property
+    def parts(self) -> tuple[tuple[str, object], ...]:
+        """Kind and object of all that draws a splat once it is filtered, the innermost first."""
+        return ("pixel kernel", self.pixel), *([("compositor", self.compositor)] if self.compositor else [])
+
+    @property
     def digest(self) -> str:
         """Hash of all fields but the words about it."""
         return digest_of_values(replace(self, source="", when="", time=None, promises=Promises()))

@@ -35,6 +35,7 @@ from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rasterizers.tiled.packages import CountingKernels
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.cores import on_free_cores
+from aaplug.system.plug_ins import filtered
 
 DRAWN_AT_ONCE = 1 << 16  # Gaussians; a multiple of 16, so that the random numbers are those of one draw
 EXPONENTIALS = 1 << 18  # at once; their array fits the cache
@@ -222,7 +223,7 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
         rows = splats.sources  # of the cut
         splats = replace(splats, sources=cut.places.index_select(0, rows))
         splats = splats if cut.shares is None else faded(splats, cut.shares.index_select(0, rows))
-    splats = stage("filter", lambda: recipe.screen(splats, camera, training))
+    splats = stage("filter", lambda: filtered("screen filter", recipe.screen, splats, camera, training))
     splats = stage("cull", lambda: cull(splats, hw, kernels=kernels))
     splats = stage("shade", lambda: shade(splats, scene, camera, kernels))
     bins = stage("bin", lambda: list(bands(splats, grid, kernels)))

@@ -53,6 +53,7 @@ from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of, within_memory
+from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
@@ -317,7 +318,12 @@ class Renderer:
         recipe, rules = self.recipe_through(splats.camera), self.training.convention.rules
         if compositor is not None:
             recipe = replace(recipe, compositor=compositor)
-        return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
+        with blaming(*recipe.parts, ("rasterizer", self.rasterizer)) as plug_ins:
+            image = self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
+            if plug_ins:
+                check_answer(f"rasterizer {self.rasterizer.name}", image, Render)
+                _check_image(image, splats, hw)
+        return image
 
     def recipe_through(self, camera: Camera | None) -> Recipe:
         """The recipe, which draws splats on rays if the camera's lens is no pinhole."""
@@ -448,7 +454,7 @@ class Renderer:
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
         if recipe.selection is not None:
-            splats = recipe.selection(splats, chunk)
+            splats = asked("selection", recipe.selection, "__call__", splats, chunk)
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
         own, screen = splats.sources, recipe.screen
@@ -459,12 +465,12 @@ class Renderer:
             splats = replace(splats, sources=places.index_select(0, own))
         elif places:
             splats = replace(splats, sources=own + places)
-        splats = screen(splats, camera, training)
+        splats = filtered("screen filter", screen, splats, camera, training)
         if camera.exposure is not None:
             splats = splats.convolved(cells(splats, camera), compensate=True, floor=0.0)
         if shares is not None:
             splats = faded(splats, shares.index_select(0, own))
-        ellipses = recipe.pixel.bounding_ellipses(splats, rules)
+        ellipses = asked("pixel kernel", recipe.pixel, "bounding_ellipses", splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
 
     @property
@@ -479,7 +485,17 @@ def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaus
     A world filter is applied even if the scene already contains one: use `mip` if it stores `filter_3D`.
     """
     scene = fuse_stored(scene)
-    return scene if recipe.world is None else recipe.world(scene, training)
+    return scene if recipe.world is None else filtered("world filter", recipe.world, scene, training)
+
+
+def _check_image(image: Render, splats: Splats2D, hw: tuple[int, int]) -> None:
+    """Raise UsageError for what is no image of the splats."""
+    expected = {"rgb": [*hw, splats.rgb.shape[1] if splats.rgb is not None else 0], "alpha": [*hw]}
+    for name, value in image._asdict().items():
+        if [*value.shape] != expected[name]:
+            raise UsageError(name, f"expected {expected[name]}, got {[*value.shape]}")
+        if not value.isfinite().all():
+            raise UsageError(name, "expected finite numbers, got some that are NaN or infinite")
 
 
 def own_look(

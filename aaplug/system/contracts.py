@@ -136,6 +136,8 @@ def described(value: Any) -> str:
         if (layout := str(getattr(value, "layout", "torch.strided"))) != "torch.strided":
             kind = f"{layout.removeprefix('torch.')} "
         return f"{kind}{str(value.dtype).removeprefix('torch.')} {list(value.shape)}{where}"
+    if isinstance(value, list | tuple) and not all(isinstance(item, SHOWN_TYPES) for item in value):
+        return f"a {type(value).__name__} of {', '.join(dict.fromkeys(map(described, value)))}"
     if isinstance(value, SHOWN_TYPES):
         text = repr(value)
         return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[:MAX_VALUE_CHARACTERS]}..."

@@ -8,6 +8,9 @@ import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
+from pathlib import Path
+from traceback import walk_tb
+from types import FrameType
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
@@ -41,6 +44,10 @@ class OutputError(AaplugError):
 
 class UsageError(AaplugError):
     """Options that contradict each other or name nothing."""
+
+
+class PlugInError(UsageError):
+    """A plug-in fails, or breaks its interface."""
 
 
 class ClusterError(UsageError):
@@ -81,11 +88,38 @@ def reason(error: Exception) -> str:
     return (strerror or str(error)).lower()
 
 
+def worded(error: BaseException, package: str) -> str:
+    """An error in words, with the last line of a package that it passed."""
+    words = str(error) if isinstance(error, AaplugError) else " ".join(f"{type(error).__name__}: {error}".split())
+    place = place_in(error, package)
+    if place < 0:
+        return words.rstrip(": ")
+    frame, line = [*walk_tb(error.__traceback__)][place]
+    return f"{words.rstrip(': ')}, in line {line} of {Path(frame.f_code.co_filename).name}"
+
+
+def place_in(error: BaseException, package: str) -> int:
+    """Place of the innermost frame of an error that runs a package's code; -1 if none does."""
+    frames = enumerate(walk_tb(error.__traceback__))
+    return max((place for place, (frame, _) in frames if top_package(frame) == package), default=-1)
+
+
+def top_package(frame: FrameType) -> str:
+    """The top package whose code a frame runs."""
+    return frame.f_globals.get("__name__", "").partition(".")[0]
+
+
 def of_system(error: BaseException | None) -> OSError | None:
     """The system's error, also behind torch's own about a full disk."""
     if isinstance(error, RuntimeError):
         error = error.__context__
     return error if isinstance(error, OSError) else None
+
+
+def is_lack_of_memory(error: Exception) -> bool:
+    """Whether an error is Python's or torch's for lack of memory."""
+    words = str(error) if isinstance(error, RuntimeError) else ""
+    return isinstance(error, MemoryError) or any(each in words for each in MEMORY_WORDS)
 
 
 @contextmanager
@@ -98,7 +132,7 @@ def within_memory(what: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not any(words in str(error) for words in MEMORY_WORDS):
+        if not is_lack_of_memory(error):
             raise
         problem = "out of memory; a smaller `scale`, fewer `threads` or fewer Gaussians need less"
         raise UsageError(what, problem) from error

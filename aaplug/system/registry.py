@@ -19,7 +19,7 @@ from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from aaplug.system.contracts import contract, described
-from aaplug.system.errors import UsageError, did_you_mean, not_one_of
+from aaplug.system.errors import UsageError, did_you_mean, not_one_of, worded
 
 PREFIX = "aaplug."
 REGISTRIES = {  # place of each kind's registry; a kind's plural, with underscores, is an entry point group
@@ -97,6 +97,10 @@ class Registry(Mapping[str, T]):
         """A registry is its process's own; a copy is that of the process that makes it."""
         return _at, (REGISTRIES[self.kind],)
 
+    def name_of(self, value: object) -> str | None:
+        """The name of an entry that is in use; None if there is no such entry."""
+        return next((name for name, entry in self._entries.items() if entry is value), None)
+
     @contract
     def find(self, name: str, parameter: str | None = None) -> T:
         """An entry by name.
@@ -140,8 +144,8 @@ class Registry(Mapping[str, T]):
                     raise UsageError(where, f"a {self.kind} named '{point.name}' exists already")
                 try:
                     value = point.load()
-                except Exception as error:  # a plug-in can fail in any way
-                    raise UsageError(where, f"cannot be imported: {error}") from error
+                except (Exception, SystemExit) as error:  # a plug-in can fail in any way
+                    raise UsageError(where, f"cannot be imported: {of_import(error, point.module)}") from error
                 self._add(point.name, value, where)
             except UsageError as error:
                 log.warning("%s; it is left out", error)
@@ -156,6 +160,11 @@ class Registry(Mapping[str, T]):
         if name_inside != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{name_inside}'")
         self._entries[name] = value
+
+
+def of_import(error: BaseException, module: str) -> str:
+    """Why a module cannot be imported."""
+    return str(error) if isinstance(error, ImportError | SyntaxError) else worded(error, module.partition(".")[0])
 
 
 def named(objects: Iterable[T]) -> dict[str, T]:

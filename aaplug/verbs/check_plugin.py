@@ -8,11 +8,15 @@ from importlib.metadata import entry_points
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from torch.autograd.gradcheck import GradcheckError
+
 from aaplug.evaluation.laws import LAWS
 from aaplug.system.contracts import contract
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, worded
 from aaplug.system.monitor import SILENT, Monitor
-from aaplug.system.registry import group_of, registry_of
+from aaplug.system.registry import group_of, of_import, registry_of
+
+MAX_PROBLEM = 300  # characters of a broken law's message
 
 
 class Verdict(NamedTuple):
@@ -35,14 +39,16 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     if not objects:
         raise UsageError(module, f"holds no object that has laws; these are for each {', '.join(LAWS)}")
     tries = [(kind, name, value, law) for kind, name, value in objects for law in LAWS[kind]]
-    verdicts = []
+    verdicts, package = [], module.partition(".")[0]
     with monitor.progress("checking", "laws") as tell:
         for done, (kind, name, value, law) in enumerate(tries, 1):
             problem = ""
             try:
                 law(value)
+            except (AssertionError, GradcheckError) as error:
+                problem = " ".join(str(error).split())[:MAX_PROBLEM] or worded(error, package)
             except Exception as error:  # a plug-in can fail in any way
-                problem = " ".join(str(error).split()) or type(error).__name__
+                problem = worded(error, package)
             verdicts.append(Verdict(kind, name, (law.__doc__ or "").splitlines()[0], problem))
             tell(done, len(tries))
     return verdicts
@@ -70,10 +76,10 @@ def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
 def _imported(module: str) -> ModuleType:
     try:
         return import_module(module)
-    except Exception as error:  # a plug-in can fail in any way
+    except (Exception, SystemExit) as error:  # a plug-in can fail in any way
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         hint = "; give the name that `import` takes, not that of the installed package" if missing else ""
-        raise UsageError(module, f"cannot be imported: {error}{hint}") from error
+        raise UsageError(module, f"cannot be imported: {of_import(error, module)}{hint}") from error
 
 
 def _is_new(kind: str, value: Any) -> bool:

@@ -13,6 +13,7 @@ from aaplug.core.rules import RULES_3DGS
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.laws import LAWS
 from aaplug.evaluation.laws.files import tells_scenes_apart
+from aaplug.evaluation.laws.filters import keeps_opacities_in_range
 from aaplug.evaluation.laws.recipes import (
     EQUAL,
     OPACITY,
@@ -149,3 +150,8 @@ def test_what_a_recipe_does_not_promise_does_not_hold(recipe):
         assert 0.2 * OPACITY < alpha_from_near(recipe) < 0.99 * OPACITY
     if not promises.equals_training:
         assert EQUAL < difference_to_training(recipe) < math.inf
+
+
+def test_a_filter_keeps_the_precision():
+    with pytest.raises(AssertionError, match=r"changes covs to torch.float64"):
+        keeps_opacities_in_range(lambda splats, *_: replace(splats, covs=splats.covs.double()))

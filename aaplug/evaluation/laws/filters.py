@@ -20,6 +20,7 @@ from aaplug.core.projection import project
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.system.plug_ins import check_answer
 
 from .base import F64, copies_of, law_of, make_camera, make_scene, make_splats, require, require_same
 
@@ -81,6 +82,7 @@ def keeps_splats(screen: ScreenFilter) -> None:
         splats = shade(project(SCENE, view), SCENE, view)
         before = copies_of(splats)
         filtered = screen(splats, view, training)
+        check_answer("`__call__`", filtered, Splats2D)
         require_same(splats, before)
         require(len(filtered) == len(splats), "leaves splats out")
         require_same(filtered, {name: before[name] for name in ("means", "depths", "sources", "rgb")})
@@ -101,7 +103,7 @@ def never_shrinks_splats(screen: ScreenFilter) -> None:
 
 @law_of("screen filter")
 def keeps_opacities_in_range(screen: ScreenFilter) -> None:
-    """Opacities stay in [0, 1], an opacity of 0 stays 0, and all values are finite at any scale."""
+    """Opacities stay in [0, 1], an opacity of 0 stays 0; at any scale values are finite and keep their precision."""
     for (view, training), sigma, dtype in product(
         SITUATIONS.values(), (1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6), (torch.float32, F64)
     ):
@@ -109,6 +111,8 @@ def keeps_opacities_in_range(screen: ScreenFilter) -> None:
         require(opacities.min() >= 0 and opacities.max() <= 1 and opacities[0] == 0, f"{opacities} at {sigma} px")
     for (view, training), (name, shape) in product(SITUATIONS.values(), EXTREMES.items()):
         filtered = screen(project(shape(SCENE.to(torch.float32)), view), view, training)
+        for column, value in copies_of(filtered).items():
+            require(value.dtype in (torch.float32, torch.int64), f"changes {column} to {value.dtype}")
         finite = all(value.isfinite().all() for value in copies_of(filtered).values())
         require(finite, f"{name} give values that are not finite")
 
@@ -152,6 +156,7 @@ def keeps_gaussians(world: WorldFilter) -> None:
     scene = world_scene()
     before, training = copies_of(scene), TrainingViews.of(scene, CAMERAS)
     once = world(scene, training)
+    check_answer("`__call__`", once, Gaussians)
     require_same(scene, before)
     require(scene.fused == (), "changes its input's `fused`")
     require(once.log_scales.shape == scene.log_scales.shape, "does not return as many Gaussians")

@@ -1,7 +1,7 @@
 """Cameras from files.
 
 A camera format is a module or object like the `CameraFormat` below.  aaplug's own are in `OWN`; a plug-in adds one by
-an entry point in the group "aaplug.camera_formats" (see `core.registry`).  `read_cameras` takes the first format whose
+an entry point in the group "aaplug.camera_formats" (`system.registry`).  `read_cameras` takes the first format whose
 `sniff` accepts the path: plug-ins first, as they may read a dialect of a file that an own format would accept too.
 """
 
@@ -32,7 +32,8 @@ from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.photos import files_of, without_suffix
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError, UsageError, listing
+from aaplug.system.errors import FormatError, PlugInError, UsageError, listing
+from aaplug.system.plug_ins import asked
 from aaplug.system.registry import Registry, named
 
 CLOSE_NAMES = 3  # names suggested for an unknown one
@@ -101,13 +102,14 @@ def read_cameras(
     path = Path(path)
     formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
-        if format.sniff(path):
+        if asked("camera format", format, "sniff", path):
             try:
-                cameras = format.read(path, options)
+                cameras = asked("camera format", format, "read", path, options)
             except UsageError as error:
-                if not error.where.startswith("camera "):  # but an option
+                value = error.__cause__ if isinstance(error, PlugInError) else error
+                if not isinstance(value, UsageError) or not value.where.startswith("camera "):  # but an option
                     raise
-                raise FormatError(path, str(error)) from error
+                raise FormatError(path, str(value)) from error
             others = [f.sign for f in formats if f.read != format.read and path.is_dir() and f.sniff(path)]
             more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
             return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
@@ -139,7 +141,7 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
 
 def holds_cameras(path: str | PathLike[str]) -> bool:
     """Whether any format recognizes cameras at this path."""
-    return any(format.sniff(Path(path)) for format in CAMERA_FORMATS.values())
+    return any(asked("camera format", each, "sniff", Path(path)) for each in CAMERA_FORMATS.values())
 
 
 def select_views(cameras: CameraSet, spec: str, option: str = "views") -> tuple[Camera, ...]:

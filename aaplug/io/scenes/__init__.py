@@ -1,7 +1,7 @@
 """Scene files, read into `Gaussians` whole or part by part, and written.
 
 A scene format is a module or object like the protocols below.  aaplug's own are in `OWN`; a plug-in adds one by an
-entry point in the group "aaplug.scene_formats" (see `core.registry`).  A file is read by the first format whose `sniff`
+entry point in the group "aaplug.scene_formats" (`system.registry`).  A file is read by the first format whose `sniff`
 accepts it: plug-ins first, as they may read a dialect of a file that an own format would accept too.  A file is written
 in the format whose name ends the file's name.
 """
@@ -28,8 +28,9 @@ from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError, OutputError, UsageError, listing
+from aaplug.system.errors import FormatError, OutputError, PlugInError, UsageError, listing
 from aaplug.system.extras import install_command
+from aaplug.system.plug_ins import asked
 from aaplug.system.registry import Registry, named
 
 log = logging.getLogger("aaplug")
@@ -152,7 +153,7 @@ def read_scene(
     if not head:
         raise FormatError(path, "is empty")
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
-    format = next((format for format in formats if format.sniff(path, head)), None)
+    format = next((each for each in formats if asked("scene format", each, "sniff", path, head)), None)
     if format is None and (path.name in STREAM_INDEXES.values() or path.suffix.lower() == RAD_SUFFIX):
         raise FormatError(path, "holds levels for another viewer; name the scene that they were made of")
     if format is None:
@@ -160,7 +161,7 @@ def read_scene(
             raise FormatError(path, "is an archive; unpack it, and name the scene's file that was in it")
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
-    scene = replace(format.open_scene(path, options), drop_bad=drop_bad)
+    scene = replace(asked("scene format", format, "open_scene", path, options), drop_bad=drop_bad)
     if numbered:
         reading = partial(read_scene, convention=convention, drop_bad=drop_bad)
         frames = SceneFrames((*numbered,), (*numbered.values(),), reading, frames_apart)
@@ -215,7 +216,10 @@ def write_parts(
     """
     writer = check_scene_output(path, overwrite, inputs)
     storable = _storable(path, parts, getattr(writer, "keeps_extras", False))
-    writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version))
+    options = SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version)
+    asked("scene format", writer, "write", Path(path), storable, count, overwrite, options)
+    if not Path(path).exists():
+        raise PlugInError(f"scene format {writer.name}", f"has not written {path}")
 
 
 def _storable(path: AnyPath, parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:

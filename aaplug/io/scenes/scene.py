@@ -28,9 +28,10 @@ from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
 from aaplug.io.scenes.rows import library_errors
-from aaplug.system.contracts import contract
+from aaplug.system.contracts import check_fields, contract
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
+from aaplug.system.plug_ins import check_answer
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
 FOLDER_INDEXES = ("meta.json", STREAM_INDEXES["sog"])  # each marks a folder that is a scene: of SOG images, of chunks
@@ -83,6 +84,9 @@ class Scene:
     others: tuple[Path, ...] = ()
     drop_bad: bool = False
     memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     @contract
@@ -194,6 +198,10 @@ class Scene:
         origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
         with library_errors(self.path):
             rows = self.load(start, stop)
+        check_answer(f"`load` of format {self.format}", rows, Gaussians)
+        if len(rows) != stop - start:
+            problem = f"`load` of format {self.format} should return {stop - start:,} Gaussians, got {len(rows):,}"
+            raise FormatError(self.path, problem)
         facts = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
         return replace(rows, **facts, origin=origin)
 
