@@ -7,8 +7,10 @@ import re
 import shlex
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +25,7 @@ from aaplug.core.colours import Colour
 from aaplug.core.splats import Render
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.laws.base import make_camera, make_scene
+from aaplug.evaluation.metric import Metric
 from aaplug.finetuning import LOSSES
 from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
 from aaplug.io.images import image_size
@@ -32,6 +35,7 @@ from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import PlugInError, UsageError
+from aaplug.system.registry import Registry
 from aaplug.verbs.check_plugin import check_plugin
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.finetune import finetune
@@ -330,3 +334,20 @@ def test_a_broken_law_shows_where_it_raises(monkeypatch):
     monkeypatch.setitem(sys.modules, "tests", module)
     [verdict] = check_plugin("tests")
     assert re.fullmatch(r"KeyError: 'key', in line \d+ of test_plugin.py", verdict.problem)
+
+
+def test_threads_may_use_a_name_for_the_first_time_at_once(monkeypatch):
+    together = threading.Barrier(3)
+
+    psnr = METRICS["PSNR"]
+
+    def found(place: str) -> Any:
+        together.wait(timeout=10)
+        return psnr
+
+    monkeypatch.setattr("aaplug.system.registry._at", found)
+    registry = Registry[Any]("metric", "aaplug.evaluation:Metric", {"PSNR": "there:PSNR"})
+    monkeypatch.setattr(Registry, "type", Metric)
+    with ThreadPoolExecutor(3) as threads:
+        metrics = list(threads.map(lambda _: registry["PSNR"], range(3)))
+    assert metrics == [psnr] * 3

@@ -16,6 +16,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from threading import get_ident
 from typing import Any, TypeVar
 
 from aaplug.system.contracts import contract, described
@@ -62,6 +63,7 @@ class Registry(Mapping[str, T]):
         self._built_in: dict[str, T | str] = dict(own)
         self._entries: dict[str, T] = {}  # loaded
         self._plug_ins_loaded = False
+        self._loading = set[int]()  # threads that load plug-ins; no lock, as an import that waits for it would not end
 
     @property
     def names(self) -> list[str]:
@@ -122,18 +124,23 @@ class Registry(Mapping[str, T]):
         """
         self._load_plug_ins()
         where = f"{self.kind} {name}"
-        if name in self._built_in:
+        if name in self._built_in or name in self._entries:
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
         self._add(name, value, where)
 
     def _load_plug_ins(self) -> None:
-        if self._plug_ins_loaded:
+        thread = get_ident()
+        if self._plug_ins_loaded or thread in self._loading:
             return
+        self._loading.add(thread)
+        try:
+            self._load_points()
+        finally:
+            self._loading.discard(thread)
         self._plug_ins_loaded = True
-        groups = set(map(group_of, REGISTRIES))
-        for group in sorted(_points().groups):
-            if group.startswith(PREFIX) and group not in groups:
-                log.warning("entry point group %s is not known%s", group, did_you_mean(group, groups))
+
+    def _load_points(self) -> None:
+        _warn_of_unknown_groups()
         for point in _points_of(self.kind):
             package = f" of package {point.dist.name}" if point.dist else ""
             where = f"plug-in {point.value}{package} ({point.group})"
@@ -151,7 +158,7 @@ class Registry(Mapping[str, T]):
                 log.warning("%s; it is left out", error)
 
     def _add(self, name: str, value: T, where: str) -> None:
-        if name in self._entries:
+        if self._entries.get(name, value) is not value:  # it is itself where another thread was first
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
         if isinstance(value, type) or not isinstance(value, self.type):
             noun = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
@@ -204,6 +211,15 @@ def _at(place: str) -> Any:
 def _points_of(kind: str) -> tuple[EntryPoint, ...]:
     """Entry points of a kind."""
     return tuple(_points().select(group=group_of(kind)))
+
+
+@cache
+def _warn_of_unknown_groups() -> None:
+    """Tell of entry point groups that look like ours, once."""
+    groups = set(map(group_of, REGISTRIES))
+    for group in sorted(_points().groups):
+        if group.startswith(PREFIX) and group not in groups:
+            log.warning("entry point group %s is not known%s", group, did_you_mean(group, groups))
 
 
 @cache
