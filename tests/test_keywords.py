@@ -1,6 +1,7 @@
 """A type checker knows the keywords of every verb, which are stated as fields of its options."""
 
 import importlib.util
+import inspect
 import json
 import subprocess
 import sys
@@ -8,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import aaplug
+from aaplug.options.base import docs_of
 from tests.conftest import ROOT
 
 # a keyword of each verb with a value, and the same misspelt
@@ -72,3 +75,14 @@ def test_a_misspelt_keyword_is_an_error(errors, verb):
 
 def test_nothing_else_is_an_error(errors):
     assert len(errors["misspelt"]) == len(KEYWORDS)
+
+
+def test_help_of_python_tells_each_keyword_and_its_plain_type():
+    verbs = [verb for name in aaplug.__all__ if hasattr(verb := getattr(aaplug, name), "options")]
+    assert aaplug.render in verbs
+    for verb in verbs:
+        signature, options = inspect.signature(verb), docs_of(verb.options)
+        assert options.keys() <= signature.parameters.keys()
+        for name, doc in options.items():
+            assert f"\n    {name}: {doc}\n" in f"{verb.__doc__}\n", (verb.__name__, name)
+        assert "Annotated" not in str(signature), verb.__name__

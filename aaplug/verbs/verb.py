@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, get_type_hints
 
 from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import SceneLike
@@ -108,9 +108,11 @@ def _with(options: Any, optional: tuple[str, ...]) -> Any:
             with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
                 return body_checked(*bound.args, options.of(keywords))
 
-        fields = inspect.signature(options).parameters.values()
+        hints = get_type_hints(options)  # without what the command line adds to them
+        fields = [p.replace(annotation=hints[name]) for name, p in inspect.signature(options).parameters.items()]
         signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
-        vars(verb).update(__signature__=signature, __doc__=documented(body.__doc__, options), options=options)
+        verb.__doc__ = documented(body.__doc__, options)
+        vars(verb).update(__signature__=signature, options=options)
         return verb
 
     return decorate
