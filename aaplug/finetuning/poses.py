@@ -24,7 +24,7 @@ SCALES = (1 / 8, 1 / 4, 1 / 2)  # of the training size
 ITERATIONS = 16  # of L-BFGS at each scale, at most
 LEVELS = 255.0  # of 8 bits: errors are in squared levels
 LEAST_CHANGE = 1e-3  # px by which a step moves the camera, or squared levels by which the error falls: a scale ends
-LEAST_GAIN = 0.05  # share by which the squared error must fall at the training size
+LEAST_GAIN = 0.05  # share by which the squared error must fall
 
 
 @dataclass(frozen=True, eq=False)

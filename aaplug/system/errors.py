@@ -117,7 +117,7 @@ def of_system(error: BaseException | None) -> OSError | None:
 
 
 def is_lack_of_memory(error: Exception) -> bool:
-    """Whether an error is Python's or torch's for lack of memory."""
+    """True if an error is Python's or torch's for lack of memory."""
     words = str(error) if isinstance(error, RuntimeError) else ""
     return isinstance(error, MemoryError) or any(each in words for each in MEMORY_WORDS)
 

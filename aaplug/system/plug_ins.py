@@ -98,7 +98,7 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
 
 
 def _is_worded(error: Exception) -> bool:
-    """Whether an error says all: it names a plug-in or a file, or is a plug-in's own words for the user."""
+    """True if an error says all: it names a plug-in or a file, or is a plug-in's own words for the user."""
     if isinstance(error, PlugInError):
         return True
     *_, (last, _) = walk_tb(error.__traceback__)

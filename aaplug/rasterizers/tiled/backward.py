@@ -170,7 +170,8 @@ def _step(
     *colours, g_hidden = planes[:-coordinates]
     limits, one = Limits.of(values), corners[:, 2:]
     before, passed = T, []
-    pixels = Pixels(corners, *planes[-coordinates:])
+    x, y, *z = planes[-coordinates:]
+    pixels = Pixels(corners, x, y, z[0] if z else None)
     nearest = next_rows(rows, ids, lists[:, 0] + ahead_of_list, lists[:, 1], STEP)
     for row, seen, alpha in in_turn(pixel, limits, nearest, pixels):
         through = transmitted(alpha, one, limits)

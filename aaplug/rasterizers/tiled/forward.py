@@ -188,7 +188,8 @@ def _pass(
     *colours, hidden = planes[:-coordinates]
     limits, one = Limits.of(values), corners[:, 2:]
     before, left = T, []
-    pixels = Pixels(corners, *planes[-coordinates:])
+    x, y, *z = planes[-coordinates:]
+    pixels = Pixels(corners, x, y, z[0] if z else None)
     nearest = next_rows(rows, ids, lists[:, 0] + ahead, lists[:, 1], pixel.splats_per_pass)
     for row, _, alpha in in_turn(pixel, limits, nearest, pixels):
         after = before * transmitted(alpha, one, limits)
@@ -233,7 +234,7 @@ def in_turn(
 def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], limits: Limits) -> Float[Tensor, "t P"]:
     """1 - alpha, with alpha capped."""
     least = 1 - limits.max_alpha
-    if torch.compiler.is_compiling():
+    if isinstance(least, Tensor):
         through = one - alpha  # the maximum of positive floats is that of their bits, an instruction less than `relu`
         return torch.maximum(through.view(torch.int32), least.view(torch.int32)).view(torch.float32)
     return (one - alpha).clamp_(min=least)
