@@ -220,7 +220,7 @@ def in_turn(
     if torch.compiler.is_compiling():
         at_corners = [materialized(form.T) for form in forms_at_corners(rows.transpose(0, 1), pixels.corners)]
         for row, u, v in zip(*(x.unbind(dim=1) for x in (rows, *at_corners)), strict=True):
-            seen = pixels._replace(at_corners=(u, v))
+            seen = Pixels(pixels.corners, pixels.x, pixels.y, pixels.z, (u, v))  # torch 2.6 does not trace `_replace`
             yield row, seen, pixel.alpha(row, seen, limits)
     else:
         alphas = pixel.alpha(rows.transpose(0, 1), pixels, limits)
