@@ -313,6 +313,19 @@ def test_a_plug_in_that_fails_in_a_verb_is_named(case, monkeypatch, tmp_path):
         assert isinstance(caught.value.__cause__, KeyError)
 
 
+def test_a_camera_format_that_fails_after_another_read_the_folder_is_named(monkeypatch):
+    @dataclass(frozen=True)
+    class Reads(Wrong):
+        def sniff(self, path: Path, *_: Any) -> bool:
+            return True
+
+    monkeypatch.setitem(CAMERA_FORMATS._entries, "first", Reads(lambda *_: CAMERAS))
+    monkeypatch.setitem(CAMERA_FORMATS._entries, "wrong", Wrong(max))
+    monkeypatch.setattr(Wrong, "sniff", fails)
+    with pytest.raises(PlugInError, match=r"^camera format wrong: fails on .* with KeyError: 'key'"):
+        read_cameras(SAMPLE)
+
+
 def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
     def refuses(*_: Any) -> Any:
         raise UsageError("scale", "is not for this metric")
@@ -337,9 +350,7 @@ def test_a_broken_law_shows_where_it_raises(monkeypatch):
 
 
 def test_threads_may_use_a_name_for_the_first_time_at_once(monkeypatch):
-    together = threading.Barrier(3)
-
-    psnr = METRICS["PSNR"]
+    together, psnr = threading.Barrier(3), METRICS["PSNR"]
 
     def found(place: str) -> Any:
         together.wait(timeout=10)

@@ -88,7 +88,7 @@ def reason(error: Exception) -> str:
     return (strerror or str(error)).lower()
 
 
-def worded(error: BaseException, package: str) -> str:
+def failure(error: BaseException, package: str) -> str:
     """An error in words, with the last line of a package that it passed."""
     words = str(error) if isinstance(error, AaplugError) else " ".join(f"{type(error).__name__}: {error}".split())
     place = place_in(error, package)

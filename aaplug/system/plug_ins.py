@@ -13,7 +13,7 @@ from types import NoneType
 from typing import Any, TypeVar
 
 from aaplug.system.contracts import WORDS, Term, described, terms_of
-from aaplug.system.errors import AaplugError, PlugInError, UsageError, is_lack_of_memory, place_in, top_package, worded
+from aaplug.system.errors import AaplugError, PlugInError, UsageError, failure, is_lack_of_memory, place_in, top_package
 from aaplug.system.registry import registry_of
 
 OURS = "aaplug"
@@ -56,17 +56,17 @@ def filtered(kind: str, filter: Callable[..., T], thing: T, *given: Any) -> T:
     answer = asked(kind, filter, "__call__", thing, *given)
     if package_of(filter) == OURS:
         return answer
+    where = _label(kind, filter)
     for name, before in vars(thing).items():
         after = getattr(answer, name)
         if not hasattr(before, "isfinite") or not hasattr(after, "isfinite"):
             continue
-        if described(after) != described(before):
-            raise PlugInError(
-                _label(kind, filter), f"{name}: expected {described(before)}, as given, got {described(after)}"
-            )
+        expected, got = described(before), described(after)
+        if got != expected:
+            raise PlugInError(where, f"{name}: expected {expected}, as given, got {got}")
         if bad := int((before.isfinite() & ~after.isfinite()).sum()):
             problem = f"{name}: expected finite numbers, got {bad} of {after.numel()} that are NaN or infinite"
-            raise PlugInError(_label(kind, filter), problem)
+            raise PlugInError(where, problem)
     return answer
 
 
@@ -94,7 +94,7 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
         if isinstance(error, UsageError) and error.where == where:
             raise
         on = "" if file is None else f" on {file}"
-        raise PlugInError(where, f"fails{on} with {worded(error, theirs[where])}") from error
+        raise PlugInError(where, f"fails{on} with {failure(error, theirs[where])}") from error
 
 
 def _is_worded(error: Exception) -> bool:

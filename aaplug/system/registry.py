@@ -20,7 +20,7 @@ from threading import get_ident
 from typing import Any, TypeVar
 
 from aaplug.system.contracts import contract, described
-from aaplug.system.errors import UsageError, did_you_mean, not_one_of, worded
+from aaplug.system.errors import UsageError, did_you_mean, failure, not_one_of
 
 PREFIX = "aaplug."
 REGISTRIES = {  # place of each kind's registry; a kind's plural, with underscores, is an entry point group
@@ -171,7 +171,7 @@ class Registry(Mapping[str, T]):
 
 def of_import(error: BaseException, module: str) -> str:
     """Why a module cannot be imported."""
-    return str(error) if isinstance(error, ImportError | SyntaxError) else worded(error, module.partition(".")[0])
+    return str(error) if isinstance(error, ImportError | SyntaxError) else failure(error, module.partition(".")[0])
 
 
 def named(objects: Iterable[T]) -> dict[str, T]:

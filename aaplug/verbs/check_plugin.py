@@ -12,7 +12,7 @@ from torch.autograd.gradcheck import GradcheckError
 
 from aaplug.evaluation.laws import LAWS
 from aaplug.system.contracts import contract
-from aaplug.system.errors import UsageError, worded
+from aaplug.system.errors import UsageError, failure
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import group_of, of_import, registry_of
 
@@ -46,9 +46,9 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
             try:
                 law(value)
             except (AssertionError, GradcheckError) as error:
-                problem = " ".join(str(error).split())[:MAX_PROBLEM] or worded(error, package)
+                problem = " ".join(str(error).split())[:MAX_PROBLEM] or failure(error, package)
             except Exception as error:  # a plug-in can fail in any way
-                problem = worded(error, package)
+                problem = failure(error, package)
             verdicts.append(Verdict(kind, name, (law.__doc__ or "").splitlines()[0], problem))
             tell(done, len(tries))
     return verdicts

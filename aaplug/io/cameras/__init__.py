@@ -110,7 +110,8 @@ def read_cameras(
                 if not isinstance(value, UsageError) or not value.where.startswith("camera "):  # but an option
                     raise
                 raise FormatError(path, str(value)) from error
-            others = [f.sign for f in formats if f.read != format.read and path.is_dir() and f.sniff(path)]
+            rest = [each for each in formats if path.is_dir() and each.read != format.read]
+            others = [each.sign for each in rest if asked("camera format", each, "sniff", path)]
             more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
             return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
     if any(format.sniff(path) for format in PATH_FORMATS):
