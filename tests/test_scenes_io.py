@@ -240,10 +240,14 @@ def test_a_name_without_suffix_is_a_folders(name: str, format: str | None):
 
 
 def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):
-    """Columns and tables of the user's own are not lost without a word; normals and colours in bytes are no loss."""
+    """Columns and tables of the user's own are not lost without a word; normals and colours in bytes are no loss.
+
+    Nor is the way up, which nerfstudio's comment tells some viewers.
+    """
     own = replace(extended("label", "nx"), after=(box, bytes(range(10))))
-    usual = plain(columns=[*extended("nx", "ny", "nz").columns, *coloured().columns[3:6]])
-    said, lost = list[str](), "the columns label and the tables chunk"
+    own = replace(own, top=[*own.top, *(f"comment {each}" for each in NERFSTUDIO)])
+    usual = plain("hello", columns=[*extended("nx", "ny", "nz").columns, *coloured().columns[3:6]])
+    said, lost = list[str](), "the columns label and the tables chunk and the comments Vertical Axis: z"
     monkeypatch.setattr(Monitor, "say", lambda self, text: said.append(text))
     for name, file in {"own": own, "usual": usual}.items():
         (tmp_path / f"{name}.ply").write_bytes(file.content)
@@ -459,6 +463,19 @@ def test_comments_of_any_alphabet_are_kept(tmp_path: Path):
         scene = read_scene(plain(text).save(tmp_path)).gaussians()
         assert through(scene, tmp_path) == plain(text).content
         assert text.encode() in through(replace(scene, convention=MIP), tmp_path)
+
+
+@pytest.mark.parametrize("order", ["<", ">", "text"])
+def test_every_coding_takes_comments_of_any_alphabet_and_empty_lines(tmp_path: Path, order: str):
+    """Tables with lists, which plyfile reads, and it takes neither."""
+    file = File(columns=shuffled, before=(box, bytes(range(10))), after=(faces, face_rows))
+    path = coded(tmp_path, file, order)
+    path.write_bytes(path.read_bytes().replace(b"element", "\ncomment 日本\nelement".encode(), 1))
+    scene, twin = read_scene(path).gaussians(), read_scene(tmp_path / "in.ply").gaussians()
+    assert same_values(scene, twin)
+    header, tables = through(scene, tmp_path).split(b"end_header\n", 1)
+    assert "\ncomment 日本\n".encode() in header
+    assert tables == through(twin, tmp_path).split(b"end_header\n", 1)[1]
 
 
 def test_empty_lines_in_a_header_are_left_out(tmp_path: Path):

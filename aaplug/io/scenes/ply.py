@@ -34,6 +34,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", "rot_2", "rot_3"))
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
 EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
+UP_AXIS = re.compile(r"vertical axis\s*:\s*[xyz+-]+", re.IGNORECASE)  # a comment of nerfstudio and Brush, for viewers
 MOST_NAMED = 24  # columns in a message
 ROWS_PER_PART = 1 << 16  # 16 MB of a scene of degree 3: few calls, and little memory beside the result
 ROWS_PER_CONVERSION = 1 << 12  # 1 MB, so that a column's stride stays within the cache
@@ -89,16 +90,18 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 
 
 def beside(scene: Gaussians) -> str:
-    """What the scene has beside its parameters and only a .ply keeps, in words: columns and tables; "" for nothing.
+    """What the scene has beside its parameters and only a .ply keeps, in words; "" for nothing.
 
-    Left out are normals, which nothing uses, and colours in bytes, which say no more than f_dc.
+    Left out are normals, which nothing uses, colours in bytes, which say no more than f_dc, and comments, but for the
+    one that says which way is up.
     """
-    columns, tables = [*scene.extras], list[str]()
+    columns, tables, comments = [*scene.extras], list[str](), list[str]()
     if document := _document_of(scene):
         header, usual = document.header, {*scene.extras, *NORMALS, *BYTE_COLOURS}
         columns += [c for c in header.vertex.names if c not in usual and not _is_parameter(c)]
         tables = [element.name for element in header.elements if element is not header.vertex]
-    named = {"columns": columns, "tables": tables}
+        comments = [comment for comment in header.comments if UP_AXIS.fullmatch(comment)]
+    named = {"columns": columns, "tables": tables, "comments": comments}
     return " and the ".join(f"{kind} {listing(names, MOST_NAMED)}" for kind, names in named.items() if names)
 
 

@@ -105,11 +105,9 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
         return _located(header, table)
     if header.coding == BIG and len(header.elements) == 1:
         return Document(header, table)
-    if not header.plain:
-        raise FormatError(path, "its header has empty lines or is not all ASCII; take them out to read it")
-    elements = _parsed(path, stamp[0], header.coding)
+    elements = _parsed(header)
     data = elements[at].data
-    if header.coding == LITTLE:
+    if header.coding == LITTLE and header.plain:
         offset = int(getattr(data, "offset", offset))
         return _located(header, Table(path, offset, table.count, dtype, stamp))
     before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
@@ -121,15 +119,18 @@ def _located(header: Header, table: Table) -> Document:
     return Document(header, table, (header.size, table.offset), (end, table.stamp[0]))
 
 
-def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
-    if coding == TEXT:
-        with warnings.catch_warnings(action="ignore"):  # numpy's, about empty lists
-            return PlyData.read(str(path)).elements
-    with path.open("rb") as stream:
+def _parsed(header: Header) -> tuple[PlyElement, ...]:
+    """All tables; a header that plyfile cannot read is given to it in ASCII and without empty lines."""
+    with open(header.path, "rb") as file, warnings.catch_warnings(action="ignore"):  # numpy's, about empty lists
+        stream = file
+        if not header.plain:
+            file.seek(header.size)
+            stream = io.BytesIO(header.content.decode("ascii", "replace").encode("ascii", "replace") + file.read())
         elements = PlyData.read(stream, mmap="r").elements
-        end = stream.tell()
-    if end != size:  # with lists, the header does not tell the size
-        raise FormatError(path, f"has {size - end:,} bytes after its last element; it is damaged")
+        if header.coding != TEXT:  # with lists, the header does not tell the size
+            spare = -stream.tell() + stream.seek(0, io.SEEK_END)
+            if spare:
+                raise FormatError(header.path, f"has {spare:,} bytes after its last element; it is damaged")
     return elements
 
 
