@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
@@ -161,7 +161,11 @@ def read_scene(
             raise FormatError(path, "is an archive; unpack it, and name the scene's file that was in it")
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
-    scene = replace(asked("scene format", format, "open_scene", path, options), drop_bad=drop_bad)
+    how: dict[str, Any] = {"drop_bad": drop_bad}
+    if convention is not None:
+        how |= {"convention": convention, "evidence": "stated by the user"}
+    scene: Scene = asked("scene format", format, "open_scene", path, options)
+    scene = replace(scene, **how, other=scene.other and replace(scene.other, **how))
     if numbered:
         reading = partial(read_scene, convention=convention, drop_bad=drop_bad)
         frames = SceneFrames((*numbered,), (*numbered.values(),), reading, frames_apart)
@@ -171,16 +175,12 @@ def read_scene(
         notes = (*scene.notes, f"the first of {len(frames)} frames, to {frames.paths[-1].name}")
         if others:
             notes = (*notes, f"no frames, and left out: {listing(others)}")
-        scene = replace(scene, folder=given, frames=frames, others=frames.paths[1:], notes=notes)
+        return replace(scene, folder=given, frames=frames, others=frames.paths[1:], notes=notes)
     if manifest is not None:
-        folder = given
-        others = (folder / MANIFEST, *(folder / level.file for level in manifest.levels[1:]))
+        others = (given / MANIFEST, *(given / level.file for level in manifest.levels[1:]))
         notes = (*scene.notes, manifest.described)
-        scene = replace(scene, folder=folder, read_levels=read_pyramid, others=others, notes=notes)
-    if convention is None:
-        return replace(scene, other=scene.other and replace(scene.other, drop_bad=drop_bad))
-    stated = {"convention": convention, "evidence": "stated by the user"}
-    return replace(scene, **stated, other=scene.other and replace(scene.other, **stated, drop_bad=drop_bad))
+        return replace(scene, folder=given, read_levels=read_pyramid, others=others, notes=notes)
+    return scene
 
 
 @contract

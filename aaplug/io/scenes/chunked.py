@@ -20,7 +20,7 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
 from aaplug.io.scenes.packed import Piece, rows_of
-from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
 from aaplug.system.errors import FormatError, counted
@@ -87,7 +87,6 @@ class ChunkedFormat:
         held = sum(chunk.count for chunk in opened)
         if count > held or not opened:
             raise FormatError(path, f"names {count:,} Gaussians in files that hold {held:,}")
-        check_count(path, count)
         first, degree = opened[0], max(chunk.sh_degree for chunk in opened)
         for chunk in opened:
             if (chunk.convention, chunk.fused, chunk.flat) != (first.convention, first.fused, first.flat):

@@ -24,7 +24,7 @@ from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.record import warn_of_moves, warn_of_sizes, whole
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
 
@@ -70,7 +70,6 @@ def _check(path: Path, header: Header) -> None:
         raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
     elements = {e.name: e for e in header.elements}
     count, chunk = header.vertex.count, elements.get("chunk")
-    check_count(path, count)
     _need(path, header.vertex, WORDS, "u4")
     if chunk is None or chunk.count * CHUNK_LENGTH < count:
         raise FormatError(path, f"has {chunk.count if chunk else 0:,} chunks, too few for {count:,} Gaussians")

@@ -21,15 +21,15 @@ def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
     """
     nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
-    names, matrix = ([], torch.empty(0, 0)) if _finite(scene) else matrix_of(scene)
+    finite = all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in scene.columns.values())
+    names, matrix = ([], torch.empty(0, 0)) if finite else matrix_of(scene)
     for name, values in zip(names, matrix.T, strict=True):
         allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0], torch.nan)
         nans[f"NaN in {name}"] = values.isnan()
         infinities[f"Inf in {name}"] = values.isinf() & (values != allowed)
     length = torch.linalg.vector_norm(scene.quats, dim=-1)
-    finite = scene.quats.isfinite().all(dim=-1)
     faults = {**nans, **infinities, "a quaternion of length zero": length <= SHORTEST_QUATERNION}
-    faults["a quaternion too long for float32"] = length.isinf() & finite
+    faults["a quaternion too long for float32"] = length.isinf() & scene.quats.isfinite().all(dim=-1)
     if scene.filter_3d is not None:
         faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
     return {text: rows for text, rows in faults.items() if rows.any()}
@@ -69,9 +69,3 @@ def doubts_of(scene: Gaussians) -> dict[str, int]:
         rows = (scene.sh.abs() > HUGE_HARMONIC).flatten(1).any(dim=1)
         doubts[f"a harmonic beyond {HUGE_HARMONIC:g}, a colour far out of range"] = int(rows.sum())
     return doubts
-
-
-def _finite(scene: Gaussians) -> bool:
-    fields = (scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
-    values = fields if scene.filter_3d is None else (*fields, scene.filter_3d)
-    return all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in values)

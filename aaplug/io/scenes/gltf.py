@@ -31,7 +31,7 @@ from aaplug.io.scenes import spz
 from aaplug.io.scenes.columns import logit_of
 from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry
 from aaplug.system.errors import FormatError, OutputError
@@ -82,7 +82,6 @@ class GltfFormat:
             for part in parts:
                 facts = read_record(path, part.extras, facts)
         count, degree = sum(part.count for part in parts), max(part.degree for part in parts)
-        check_count(path, count)
         notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
         load, others = partial(rows_of, [(part.count, part.load) for part in parts], degree), tuple(document.files)
         return Scene(path, self.name, count, degree, load, *facts, notes=tuple(filter(None, notes)), others=others)

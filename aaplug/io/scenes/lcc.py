@@ -21,7 +21,7 @@ from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import sh_of_colour
 from aaplug.io.scenes.packed import MAX_BYTE, Piece, byte_opacities, floats, largest_last, rows_of
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors, read_rows
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.io.values import Entry, entries, natural, object_of, read_bounded, read_json, text
@@ -73,7 +73,6 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
             read = partial(read_rows, sky, far)
             pieces.append((count, partial(_load, read, read, ends([f"env{kind}" for kind in kinds]))))
     count = sum(count for count, _ in pieces)
-    check_count(path, count)
     used = tuple(beside[each] for each in (*names, "environment.bin") if each in beside)
     notes = (f"the finest of {levels} levels", CREDIT)
 

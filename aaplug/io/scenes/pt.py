@@ -21,7 +21,7 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.ply_tags import run_config
 from aaplug.io.scenes.record import Facts
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
 
@@ -62,7 +62,6 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
             raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
         splats = _splats(path, document)
     count = len(splats["means"])
-    check_count(path, count)
     for key, tensor in splats.items():
         _check(path, key, tensor, count, size)
     degree = DEGREES[3 * splats["shN"].shape[1]]

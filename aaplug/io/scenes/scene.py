@@ -9,6 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from aaplug.io import STREAM_INDEXES
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
-from aaplug.io.scenes.rows import library_errors
+from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
@@ -64,6 +65,9 @@ class Scene:
     others: further files that hold it: other levels of detail or frames, images of SOG.
     drop_bad: rows that cannot be used are left out, instead of raising FormatError.
     memory: what was read of it, by name: each part is read once.
+
+    Raises:
+        FormatError: the file holds more Gaussians than the limit GAUSSIANS.
     """
 
     path: Path | None
@@ -87,6 +91,8 @@ class Scene:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.path is not None:
+            check_count(self.path, self.count)
 
     @classmethod
     @contract
@@ -103,14 +109,14 @@ class Scene:
         if (origin := finest.origin) is not None:
             format, evidence, document = origin.format, origin.evidence, origin.document
         format = format if levels is None else "levels"
-        scene = cls(None, format, len(finest), finest.sh_degree, _Rows(finest), evidence, *facts, document)
+        scene = cls(None, format, len(finest), finest.sh_degree, partial(held_rows, finest), evidence, *facts, document)
         scene.memory.update(gaussians=finest, levels=levels)
         return scene
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies hold the rows: what reads a file does not leave its process."""
         rows = self.raw(0, self.count)
-        return {**vars(self), "load": _Rows(rows), "other": None}
+        return {**vars(self), "load": partial(held_rows, rows), "other": None}
 
     @property
     def name(self) -> str:
@@ -241,13 +247,11 @@ class Scene:
     def decoded(self) -> "Scene":
         """This reading alone, its rows decoded once and kept; raises FormatError as `gaussians`."""
         self.check_memory()
-        return replace(self, load=_Rows(self.raw(0, self.count)), other=None)
+        return replace(self, load=partial(held_rows, self.raw(0, self.count)), other=None)
 
     def sample(self, each: int) -> Gaussians:
         """Usable Gaussians from evenly spaced places, `each` at a place: enough to know where the scene is."""
-        some = joined([self.raw(rows.start, rows.stop) for rows in probes(self.count, each)] or [self.raw(0, 0)])
-        finite = [column.flatten(1 if column.ndim > 1 else 0).isfinite() for column in some.columns.values()]
-        return some[torch.stack([f if f.ndim == 1 else f.all(dim=1) for f in finite]).all(dim=0)]
+        return usable(joined([self.raw(p.start, p.stop) for p in probes(self.count, each)] or [self.raw(0, 0)]))
 
     @property
     def harmonics_bytes(self) -> int:
@@ -312,14 +316,9 @@ class SceneFrames:
         return training
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Reads rows of Gaussians in memory."""
-
-    rows: Gaussians
-
-    def __call__(self, start: int, stop: int) -> Gaussians:
-        return self.rows[start:stop]
+def held_rows(held: Gaussians, start: int, stop: int) -> Gaussians:
+    """The rows from start up to stop of Gaussians in memory."""
+    return held[start:stop]
 
 
 def probes(count: int, each: int) -> list[range]:

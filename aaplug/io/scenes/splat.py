@@ -15,7 +15,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import sh_of_colour
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats
 from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors, read_rows
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError
 
@@ -41,7 +41,6 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         what = f"has {size:,} bytes, which is not a multiple of {RECORD.itemsize}"
         raise FormatError(path, f"{what}; it is cut short or not a .splat")
     count = size // RECORD.itemsize
-    check_count(path, count)
     return Scene(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
 
 

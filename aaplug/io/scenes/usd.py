@@ -30,7 +30,7 @@ from aaplug.io.cameras.usd import module
 from aaplug.io.scenes.columns import logit_of
 from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, entries, object_of, parse_json, text
 from aaplug.system.errors import FormatError, OutputError, UsageError
@@ -76,7 +76,6 @@ class UsdFormat:
             parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(prims)]
             degree = max(part.sh_degree for part in parts)
             scene = joined([of_degree(part, degree) for part in parts])
-            check_count(path, len(scene))
             said = told["record"]
             record = {} if said is None else {KEY: parse_json(said.encode(), path)}
             facts = read_record(path, record, Facts(EVIDENCE))
