@@ -43,6 +43,12 @@ def replacing(path: AnyPath, overwrite: bool) -> Iterator[BinaryIO]:
         yield stream
 
 
+def write_file(path: AnyPath, content: bytes, overwrite: bool) -> None:
+    """Write a file whose content is known."""
+    with replacing(path, overwrite) as stream:
+        stream.write(content)
+
+
 @contextmanager
 def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
     """Like `replacing`, for libraries that open their file themselves: yields an empty file that ends in `suffix`."""

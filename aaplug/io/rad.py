@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -101,8 +101,8 @@ def _crowded(parents: Int[Tensor, " n"]) -> int | None:
     return most - 1 if counts[most] > MAX_CHILDREN else None
 
 
-def write_rad(stream: BinaryIO, tree: Tree) -> None:
-    """Write a tree, its harmonics up to degree 3."""
+def rad_of(tree: Tree) -> bytes:
+    """The file of a tree, its harmonics up to degree 3."""
     degree = min(len(BANDS), tree.scene.sh_degree)
     facts = {"version": VERSION, "maxSh": degree, "lodTree": True, "splatEncoding": _spans(tree.scene, degree)}
     chunks = [_chunk(tree, facts, base) for base in range(0, len(tree.scene), CHUNK_GAUSSIANS)]
@@ -110,8 +110,7 @@ def write_rad(stream: BinaryIO, tree: Tree) -> None:
     ends = sizes.cumsum()
     places = [{"offset": int(end - size), "bytes": int(size)} for size, end in zip(sizes, ends, strict=True)]
     whole = {"type": "gsplat", "count": len(tree.scene), "chunkSize": CHUNK_GAUSSIANS, "comment": "aaplug"}
-    stream.write(_headed(b"RAD0", facts | whole | {"allChunkBytes": int(ends[-1]), "chunks": places}))
-    stream.writelines(chunks)
+    return b"".join([_headed(b"RAD0", facts | whole | {"allChunkBytes": int(ends[-1]), "chunks": places}), *chunks])
 
 
 def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:

@@ -15,11 +15,10 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.resources import files
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,8 +29,8 @@ from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.orbits import Frame
 from aaplug.core.placing import box_of
 from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
-from aaplug.io.atomic import make_folder, replacing
-from aaplug.io.rad import MAX_NODE_SIZE, tree_of, write_rad
+from aaplug.io.atomic import make_folder, replacing, write_file
+from aaplug.io.rad import MAX_NODE_SIZE, rad_of, tree_of
 from aaplug.io.scenes import gltf, read_scene, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.io.scenes.rows import library_errors
@@ -134,8 +133,7 @@ def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gau
         return [float(len(part)), *box_of(part, stream.extent).flatten().tolist()]
 
     facts = [*Threads(given_threads()).map(write, enumerate(parts))]
-    with replacing(facts_file(folder, number), overwrite=True) as file:
-        file.write(json.dumps(facts).encode())
+    write_file(facts_file(folder, number), json.dumps(facts).encode(), overwrite=True)
 
 
 def write_front(folder: Path, number: int, front: Front, start: int) -> None:
@@ -204,23 +202,21 @@ def write_index(
     stream = STREAMS[name]
     if name == "rad":
         front = read_front(folder, levels - 1)
-        write, settings = partial(write_rad, tree=tree_of(front.scene, front.parents)), _spark_settings(front)
+        content, settings = rad_of(tree_of(front.scene, front.parents)), _spark_settings(front)
     else:
         parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
-        write = partial(_write_json, value=index)
+        content = _json(index)
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
     view = {name: getattr(frame, name).tolist() for name in ("up", "front", "centre")} | {"radius": frame.radius}
-    with replacing(folder / SETTINGS, overwrite=True) as target:
-        _write_json(target, {**settings, "view": view})
-    with replacing(folder / stream.index, overwrite=True) as target:  # last: it is the mark
-        write(target)
+    write_file(folder / SETTINGS, _json({**settings, "view": view}), overwrite=True)
+    write_file(folder / stream.index, content, overwrite=True)  # last: it is the mark
     return settings
 
 
-def _write_json(stream: BinaryIO, value: Mapping[str, Any]) -> None:
-    stream.write(json.dumps(value, indent=1).encode())
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, indent=1).encode()
 
 
 def _read_parts(path: Path) -> list["_Part"]:
@@ -256,10 +252,8 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
                 shutil.copy(program, viewer)
     except OSError as error:
         raise OutputError(viewer, f"cannot be written: {reason(error)}") from error
-    page, script = (files(stream_pages).joinpath(file).read_bytes() for file in (f"{name}.html", ORBIT))
-    for file, text in {ORBIT: script, PAGE: page}.items():
-        with replacing(folder / file, overwrite=True) as stream:
-            stream.write(text)
+    for file, source in {ORBIT: ORBIT, PAGE: f"{name}.html"}.items():
+        write_file(folder / file, files(stream_pages).joinpath(source).read_bytes(), overwrite=True)
 
 
 class _Part(NamedTuple):

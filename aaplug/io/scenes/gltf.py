@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.atomic import replacing
+from aaplug.io.atomic import replacing, write_file
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.columns import logit_of
@@ -101,8 +101,7 @@ class GltfFormat:
         if self.name == "spz.glb":
             blob = spz.packed(path, scenes, 2, "RUB")
             blob += bytes(-len(blob) % 4)
-            with replacing(path, overwrite) as stream:
-                stream.write(glb_start(document.json(blob=len(blob)), len(blob)) + blob)
+            write_file(path, glb_start(document.json(blob=len(blob)), len(blob)) + blob, overwrite)
         else:
             data = bytearray(document.size)
             for part in scenes:

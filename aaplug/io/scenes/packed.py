@@ -20,7 +20,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import mirrored, placed
-from aaplug.io.atomic import check_output, replacing
+from aaplug.io.atomic import check_output, write_file
 from aaplug.io.limits import limit
 from aaplug.io.scenes.columns import logit_of
 from aaplug.io.values import Place
@@ -92,10 +92,8 @@ def replacing_group(
         stem, _, suffix = plain.rpartition(".")
         names[plain] = f"{stem}-{sha256(content).hexdigest()[:HASH_DIGITS]}.{suffix}"
         earlier |= set(path.parent.glob(f"{escape(stem)}-{'[0-9a-f]' * HASH_DIGITS}.{suffix}"))
-        with replacing(path.with_name(names[plain]), overwrite=True) as stream:
-            stream.write(content)
-    with replacing(path, overwrite) as stream:
-        stream.write(whole(names))
+        write_file(path.with_name(names[plain]), content, overwrite=True)
+    write_file(path, whole(names), overwrite)
     stale = {json.dumps(file.name).strip('"').encode(): file for file in earlier if file.name not in names.values()}
     for other in path.parent.glob(f"*{path.suffix}") if stale else ():
         if other == path or not other.is_file():

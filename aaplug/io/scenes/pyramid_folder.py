@@ -21,7 +21,7 @@ from torch import Tensor
 from aaplug.core.chunks import chunks_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
-from aaplug.io.atomic import AnyPath, replacing
+from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.values import entries, natural, number, object_of, read_json, text
@@ -138,8 +138,8 @@ def levels_in(folder: AnyPath, manifest: Manifest, start: int = 0) -> Iterator[L
 
 def write_manifest(folder: AnyPath, manifest: Manifest) -> None:
     """Write lod.json, replacing it; raises OutputError if it cannot be written."""
-    with replacing(Path(folder) / MANIFEST, overwrite=True) as stream:
-        stream.write(json.dumps({KEY: VERSION, **asdict(manifest)}).encode())
+    content = json.dumps({KEY: VERSION, **asdict(manifest)}).encode()
+    write_file(Path(folder) / MANIFEST, content, overwrite=True)
 
 
 def hash_of(path: Path) -> str:

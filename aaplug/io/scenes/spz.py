@@ -29,7 +29,7 @@ from torch import Tensor
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored
-from aaplug.io.atomic import replacing
+from aaplug.io.atomic import write_file
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import (
     byte_opacities,
@@ -258,8 +258,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     content = packed(path, scenes, options.spz_version, AXES_WRITTEN[axes])
     kept = Facts("", COMPENSATED if scenes[0].convention.compensated else CLASSIC)
     warn_of_losses(path, name, scenes[0], kept)
-    with replacing(path, overwrite) as stream:
-        stream.write(content)
+    write_file(path, content, overwrite)
 
 
 def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> bytes:
