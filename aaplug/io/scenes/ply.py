@@ -8,7 +8,7 @@ back unchanged.  Output is little-endian binary.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -16,6 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.lib.recfunctions import structured_to_unstructured
+from torch import Tensor
 
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
@@ -37,8 +40,7 @@ EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3
 UP_AXIS = re.compile(r"vertical axis\s*:\s*[xyz+-]+", re.IGNORECASE)  # a comment of nerfstudio and Brush, for viewers
 MOST_NAMED = 24  # columns in a message
 ROWS_PER_PART = 1 << 16  # 16 MB of a scene of degree 3: few calls, and little memory beside the result
-ROWS_PER_CONVERSION = 1 << 12  # 1 MB, so that a column's stride stays within the cache
-ROWS_PER_WRITE = 1 << 16  # 16 MB
+ROWS_PER_WRITE = 1 << 13  # 2 MB, so that a column's stride stays within the cache
 
 name = "ply"
 needs = None
@@ -159,35 +161,22 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
 
 
 def _part(document: Document, degree: int, flat: bool, start: int, stop: int) -> Gaussians:
-    table = document.table
-    assert table is not None
-    rows = table.read(start, stop)
-    names = rows.dtype.names or ()
-    if _one_type(rows.dtype):
-        values = torch.from_numpy(_matrix(rows))
-    else:
-        names = tuple(name for name in names if _is_parameter(name))
-        values = torch.empty(len(rows), len(names))
-        for begin in range(0, len(rows), ROWS_PER_CONVERSION):
-            part = slice(begin, begin + ROWS_PER_CONVERSION)
-            for i, column in enumerate(names):
-                values[part, i] = torch.from_numpy(rows[column][part].astype(np.float32))
+    assert document.table is not None
+    rows = document.table.read(start, stop)
+    columns = rows.dtype.names or ()
+    names = [c for c in columns if rows.dtype[c].kind == "f"]
+    values = _matrix(rows, names)
     if COLOURS[0] not in names:
-        colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
-        harmonics = sh_of_colour(torch.from_numpy(colours) / np.iinfo(np.uint8).max)
+        harmonics = sh_of_colour(_matrix(rows, BYTE_COLOURS) / np.iinfo(np.uint8).max)
         names, values = (*names, *COLOURS), torch.cat([values, harmonics], dim=1)
-    kept = [c for c in rows.dtype.names or () if c in EXTRAS or LEARNED_COLUMN.fullmatch(c)]
+    kept = [c for c in columns if c in EXTRAS or LEARNED_COLUMN.fullmatch(c)]
     extras = {c: torch.from_numpy(rows[c].astype(np.float32)) for c in kept}
     return replace(scene_of(names, values, degree, flat), extras=extras)
 
 
-def _one_type(dtype: np.dtype) -> bool:
-    """True if all columns are little-endian float32, so that the rows are a matrix."""
-    return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
-
-
-def _matrix(rows: np.ndarray) -> np.ndarray:
-    return rows.view("<f4").reshape(len(rows), len(rows.dtype.names or ()))
+def _matrix(rows: np.ndarray, names: Sequence[str]) -> Float[Tensor, "n c"]:
+    """Columns as float32, without a copy if they are that and follow each other."""
+    return torch.from_numpy(np.ascontiguousarray(structured_to_unstructured(rows[[*names]], np.float32)))
 
 
 def _plain_header(scene: Gaussians) -> Header:
@@ -221,22 +210,20 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     """
     records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in header.vertex.properties]))
     parameters, matrix = matrix_of(scene)
-    values = matrix.detach().cpu().numpy()
-    assert not np.isnan(values).any(), "a parameter is NaN"
-    names, at_once = header.vertex.names, _one_type(records.dtype)
-    if at_once:
-        _matrix(records)[:, [names.index(column) for column in parameters]] = values
-    old, document = None, _document_of(scene)
-    if document and document.table and scene.origin and not (at_once and set(names) == set(parameters)):
-        old = document.table.take(scene.origin.rows.cpu())
+    assert not matrix.isnan().any(), "a parameter is NaN"
+    values = dict(zip(parameters, matrix.detach().cpu().numpy().T, strict=True))
+    values |= {name: column.cpu().numpy() for name, column in scene.extras.items()}
+    old, document = {}, _document_of(scene)
+    unchanged = any(p.name not in values or p.code != "f4" for p in header.vertex.properties)
+    if unchanged and document and document.table and scene.origin:
+        rows = document.table.take(scene.origin.rows.cpu())
+        old = {name: rows[name] for name in rows.dtype.names or ()}
     for p in header.vertex.properties:
-        was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
-        if p.name in scene.extras or (p.name in parameters and not at_once):
-            extra = p.name in scene.extras
-            new = scene.extras[p.name].cpu().numpy() if extra else values[:, parameters.index(p.name)]
-            if was is not None and p.code != "f4":
-                new = np.where(was.astype(np.float32) == new, was, new)
+        new, was = values.get(p.name), old.get(p.name)
+        if new is None:
+            new = was
+        elif was is not None and p.code != "f4":
+            new = np.where(was.astype(np.float32) == new, was, new)
+        if new is not None:
             records[p.name] = new
-        elif p.name not in parameters and was is not None:
-            records[p.name] = was
     return records
