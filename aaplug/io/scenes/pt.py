@@ -60,37 +60,33 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
                 document = torch.load(path, "cpu", weights_only=True, mmap=True)
         except pickle.UnpicklingError as error:  # torch's own words advise loading everything else too
             raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
-        splats = _splats(path, document)
-    count = len(splats["means"])
-    for key, tensor in splats.items():
-        _check(path, key, tensor, count, size)
-    degree = DEGREES[3 * splats["shN"].shape[1]]
+        splats = _splats(path, document, size)
+    count, degree = len(splats["means"]), DEGREES[3 * splats["shN"].shape[1]]
     return Scene(path, name, count, degree, partial(_rows, splats), *(run_config(path) or UNKNOWN))
 
 
-def _splats(path: Path, document: Any) -> dict[str, Tensor]:
-    """The tensors by gsplat's names.  A tensor can be a mere description, sparse, nested, quantized or a scalar."""
+def _splats(path: Path, document: Any, size: int) -> dict[str, Tensor]:
+    """The tensors by gsplat's names.  One can be a mere description, sparse, nested, quantized or a scalar."""
     splats = document.get("splats", document) if isinstance(document, dict) else None
     if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
         raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
-    rest = splats.get("shN")
-    tensors = {**{key: splats[key] for key in SHAPES}, **({} if rest is None else {"shN": rest})}
+    tensors = {key: splats[key] for key in (*SHAPES, "shN") if splats.get(key) is not None}
     for key, value in tensors.items():
         dense = isinstance(value, Tensor) and value.layout == torch.strided
         plain = dense and not value.is_nested and not value.is_quantized and value.device.type == "cpu"
         if not plain or value.ndim == 0:
             raise FormatError(path, f"{key} should be a tensor with a row for each Gaussian, on the CPU")
-    return {"shN": torch.zeros(len(tensors["means"]), 0, 3), **tensors}
-
-
-def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
-    right = tensor.shape[1:] == SHAPES.get(key)
-    if key == "shN":
-        right = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
-    if not (right and tensor.is_floating_point() and len(tensor) == count):
-        raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
-    if tensor.numel() * tensor.element_size() > size:
-        raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
+    count = len(tensors["means"])
+    tensors = {"shN": torch.zeros(count, 0, 3), **tensors}
+    for key, tensor in tensors.items():
+        right = tensor.shape[1:] == SHAPES.get(key)
+        if key == "shN":
+            right = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
+        if not (right and tensor.is_floating_point() and len(tensor) == count):
+            raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
+        if tensor.numel() * tensor.element_size() > size:
+            raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
+    return tensors
 
 
 def _rows(tensors: dict[str, Tensor], start: int, stop: int) -> Gaussians:
