@@ -74,7 +74,7 @@ from .core.spectra import frequency_response as frequency_response
 from .core.splats import Splats2D as Splats2D
 from .io.atomic import replacing as replacing
 from .io.cameras.sets import CameraFileOptions as CameraFileOptions
-from .io.scenes.columns import logit_of as logit_of, sh_of_colour as sh_of_colour
+from .io.scenes.packed import logit_of as logit_of, sh_of_colour as sh_of_colour
 from .io.scenes.rows import SceneFileOptions as SceneFileOptions, check_count as check_count
 from .io.scenes.rows import library_errors as library_errors
 from .methods.pixel_kernels import raster_rows as raster_rows

@@ -25,7 +25,7 @@ from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
-from aaplug.io.scenes.columns import sh_of_colour
+from aaplug.io.scenes.packed import sh_of_colour
 from aaplug.methods.filters.dilation import limited
 from aaplug.methods.pixel_kernels.point import POINT, Point
 from aaplug.methods.viewers import VIEWERS, Viewer

@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,11 +107,10 @@ def rad_of(tree: Tree) -> bytes:
     degree = min(len(BANDS), tree.scene.sh_degree)
     facts = {"version": VERSION, "maxSh": degree, "lodTree": True, "splatEncoding": _spans(tree.scene, degree)}
     chunks = [_chunk(tree, facts, base) for base in range(0, len(tree.scene), CHUNK_GAUSSIANS)]
-    sizes = np.array([len(chunk) for chunk in chunks])
-    ends = sizes.cumsum()
-    places = [{"offset": int(end - size), "bytes": int(size)} for size, end in zip(sizes, ends, strict=True)]
+    sizes = [len(chunk) for chunk in chunks]
+    places = [{"offset": end - size, "bytes": size} for size, end in zip(sizes, accumulate(sizes), strict=True)]
     whole = {"type": "gsplat", "count": len(tree.scene), "chunkSize": CHUNK_GAUSSIANS, "comment": "aaplug"}
-    return b"".join([_headed(b"RAD0", facts | whole | {"allChunkBytes": int(ends[-1]), "chunks": places}), *chunks])
+    return b"".join([_headed(b"RAD0", facts | whole | {"allChunkBytes": sum(sizes), "chunks": places}), *chunks])
 
 
 def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The parameters of Gaussians as the named columns of a .ply, and the values that other formats give."""
+"""The parameters of Gaussians as the named columns of a .ply."""
 
 from collections.abc import Sequence
 
@@ -6,9 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
-from aaplug.system.contracts import contract
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 
 FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
 DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
@@ -53,15 +51,3 @@ def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, fl
         filter_3d=chosen(FILTER_COLUMN)[:, 0] if FILTER_COLUMN in at else None,
         flat=flat,
     )
-
-
-@contract
-def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Logits of opacities; finite at 0 and 1."""
-    return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
-
-
-@contract
-def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Harmonics of degree 0 of colours in [0, 1]."""
-    return (rgb - COLOUR_OFFSET) / SH_C0

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.columns import DEGREES, sh_of_colour
-from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_last, without_largest
+from aaplug.io.scenes.columns import DEGREES
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, fractions, sh_of_colour, without_largest, word_quats
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
@@ -32,7 +32,7 @@ WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")]
-ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
+ELEVEN_TEN_ELEVEN, COMPONENTS = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10))
 CHUNK_LENGTH = 256  # Gaussians
 SH_SPAN = 8.0  # harmonics lie between -4 and 4
 MOST_DEGREE = 3
@@ -94,7 +94,7 @@ def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int,
     rest = tables["sh"].read(start, stop) if degree else None
     of_row = np.arange(start, stop) // CHUNK_LENGTH
     colour = words["packed_color"]
-    rgb = _fractions(colour, (24, 8), (16, 8), (8, 8))
+    rgb = fractions(colour, (24, 8), (16, 8), (8, 8))
     if COLOUR_BOUNDS[0] in (bounds.dtype.names or ()):
         rgb = _between(bounds, COLOUR_BOUNDS, of_row, rgb)
     sh = torch.zeros(len(words), (degree + 1) ** 2, 3)
@@ -103,10 +103,9 @@ def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int,
         k = sh.shape[1] - 1
         for i in range(3 * k):
             sh[:, 1 + i % k, i // k] = _harmonic(rest[f"f_rest_{i}"])
-    means = _between(bounds, BOUNDS, of_row, _fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
-    scales = _between(bounds, SCALE_BOUNDS, of_row, _fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
-    three = (_fractions(words["packed_rotation"], (20, 10), (10, 10), (0, 10)) - 0.5) * 2**0.5
-    quats = largest_last(three, floats(words["packed_rotation"] >> 30))
+    means = _between(bounds, BOUNDS, of_row, fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
+    scales = _between(bounds, SCALE_BOUNDS, of_row, fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
+    quats = word_quats(words["packed_rotation"], *COMPONENTS)
     return Gaussians(means, quats, scales, byte_opacities(colour & 255), sh)
 
 
@@ -117,17 +116,10 @@ def _between(
     return torch.lerp(ends[:, :3], ends[:, 3:], share)
 
 
-def _fractions(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "n c"]:
-    """Fields of the words, each a place and a number of bits, as fractions of the largest value."""
-    masks = [(shift, (1 << bits) - 1) for shift, bits in fields]
-    return torch.stack([floats(words >> shift & mask) / mask for shift, mask in masks], dim=1)
-
-
 def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:
     """Bytes stand for the centres of 256 steps, the first and the last byte for the ends of the range."""
-    middle = (floats(values) + 0.5) / 256
-    ends = torch.from_numpy(values == 255).float()
-    share = torch.where(torch.from_numpy((values == 0) | (values == 255)), ends, middle)
+    steps = torch.from_numpy(values).float()
+    share = torch.where(steps == 0, 0.0, torch.where(steps == 255, 1.0, (steps + 0.5) / 256))
     return (share - 0.5) * SH_SPAN
 
 
@@ -146,7 +138,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     warn_of_moves(path, name, [(scene, ((shares[0] * steps).round() / steps - shares[0]) * span)])
     warn_of_sizes(path, name, [scene], -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     rest, largest = without_largest(scene.unit_quats)
-    turns = _word(rest / 2**0.5 + 0.5, (20, 10), (10, 10), (0, 10)) | largest << 30
+    turns = _word(rest / 2**0.5 + 0.5, *COMPONENTS) | largest << 30
     rgba = torch.cat([shares[2], scene.opacities[:, None]], dim=1)
     words = [_word(shares[0], *ELEVEN_TEN_ELEVEN), turns, _word(shares[1], *ELEVEN_TEN_ELEVEN)]
     words.append(_word(rgba, (24, 8), (16, 8), (8, 8), (0, 8)))
@@ -178,7 +170,7 @@ def _bounded(
 
 
 def _word(shares: Float[Tensor, "n c"], *fields: tuple[int, int]) -> Int[Tensor, " n"]:
-    """Fractions as fields of a word; the inverse of `_fractions`."""
+    """Fractions as fields of a word; the inverse of `fractions`."""
     parts = [(share * ((1 << bits) - 1)).round().long() << shift for share, (shift, bits) in zip(
         shares.clamp(0, 1).unbind(dim=1), fields, strict=True)]  # fmt: skip
     return torch.stack(parts).sum(dim=0)

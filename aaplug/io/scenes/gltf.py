@@ -28,8 +28,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing, write_file
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
-from aaplug.io.scenes.columns import logit_of
-from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, replacing_group, rows_of, standing
+from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, logit_of, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene

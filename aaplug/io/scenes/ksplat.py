@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.columns import sh_of_colour
-from aaplug.io.scenes.packed import byte_opacities, floats
+from aaplug.io.scenes.packed import byte_opacities, floats, sh_of_colour
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE

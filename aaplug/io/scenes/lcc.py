@@ -19,8 +19,7 @@ from torch import Tensor
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.columns import sh_of_colour
-from aaplug.io.scenes.packed import MAX_BYTE, Piece, byte_opacities, floats, largest_last, rows_of
+from aaplug.io.scenes.packed import Piece, byte_opacities, floats, fractions, rows_of, sh_of_colour, word_quats
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -34,8 +33,8 @@ FAR_RECORD = np.dtype([*FIELDS, WORDS])  # of the environment, with its harmonic
 LEVEL = [("count", "<u4"), ("start", "<u8"), ("size", "<u4")]
 KINDS = {"Portable": 0, "Quality": 3}  # degree of harmonics by fileType
 COEFFICIENTS = 15  # of harmonics, beside that of degree 0
-SHIFTS, MOST = np.array([0, 11, 21], np.uint32), np.array([2047, 1023, 2047], np.uint32)  # of a word's three channels
-QUATERNION_BITS, MOST_QUATERNION, MOST_SCALE = 10, 1023, 65535
+CHANNELS, COMPONENTS = ((0, 11), (11, 10), (21, 11)), ((0, 10), (10, 10), (20, 10))  # of words: place, number of bits
+MOST_SCALE = 65535
 MAX_LEVELS = 64
 Z_UP = torch.tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # to y down and z forward
 CREDIT = "Data Organization Format originated from XGRIDS"  # its license asks to show it
@@ -90,14 +89,11 @@ def turned_from_z_up(scene: Gaussians) -> Gaussians:
 def _load(read: Read, read_harmonics: Read, ends: Sequence[Float[Tensor, "2 3"]], start: int, stop: int) -> Gaussians:
     """The rows from start up to stop, in the file's axes.  ends: of scales, and of harmonics if there are any."""
     rows = read(start, stop)
-    words = rows["quats"][:, None] >> np.arange(4, dtype=np.uint32) * QUATERNION_BITS
-    rest = (floats(words[:, :3] & MOST_QUATERNION) / MOST_QUATERNION - 0.5) * 2**0.5
-    quats = largest_last(rest, torch.from_numpy(words[:, 3].astype(np.int64))).roll(1, dims=1)
+    quats = word_quats(rows["quats"], *COMPONENTS).roll(1, dims=1)
     scales = torch.lerp(ends[0][0], ends[0][1], floats(rows["scales"]) / MOST_SCALE)
-    sh = sh_of_colour(floats(rows["rgba"][:, :3]) / MAX_BYTE)[:, None]
+    sh = sh_of_colour(floats(rows["rgba"][:, :3]) / 255)[:, None]
     if len(ends) > 1:
-        packed = read_harmonics(start, stop)["sh"]
-        values = floats((packed[:, :COEFFICIENTS, None] >> SHIFTS & MOST) / MOST)
+        values = fractions(read_harmonics(start, stop)["sh"][:, :COEFFICIENTS], *CHANNELS)
         sh = torch.cat([sh, torch.lerp(ends[1][0], ends[1][1], values)], dim=1)
     return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
 

@@ -1,4 +1,4 @@
-"""Shared by the compressed formats: bounded decompression, packed quaternions, axes, and files of several files.
+"""What formats beside .ply share: values as they store them, bounded decompression, axes, and files of several files.
 
 n: rows.  Arrays are numpy's, as they come from files.
 
@@ -18,12 +18,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians, joined
 from aaplug.core.placing import mirrored, placed
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import check_output, write_file
 from aaplug.io.limits import limit
-from aaplug.io.scenes.columns import logit_of
 from aaplug.io.values import Place
+from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError
 
 MAX_BYTE = 255
@@ -49,6 +50,11 @@ def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "
     return torch.cat([rest, missing[:, None]], dim=1).gather(1, order[largest.long()])
 
 
+def word_quats(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions from words: two bits for the largest component, and fields (see `fractions`) for the others."""
+    return largest_last((fractions(words, *fields) - 0.5) * 2**0.5, floats(words >> 30))
+
+
 def without_largest(quats: Float[Tensor, "n 4"]) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
     """What `largest_last` takes: the three smaller components, where the largest is positive, and its index."""
     largest = quats.abs().argmax(dim=1)
@@ -65,6 +71,24 @@ def bytes_of(values: Tensor) -> np.ndarray:
 def byte_opacities(alpha: np.ndarray) -> Float[Tensor, " n"]:
     """Logits of opacities stored as bytes."""
     return logit_of(floats(alpha) / MAX_BYTE)
+
+
+@contract
+def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Logits of opacities; finite at 0 and 1."""
+    return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
+
+
+@contract
+def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Harmonics of degree 0 of colours in [0, 1]."""
+    return (rgb - COLOUR_OFFSET) / SH_C0
+
+
+def fractions(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "*n c"]:
+    """Fields of words, each a place and a number of bits, as fractions of the largest value."""
+    masks = [(shift, (1 << bits) - 1) for shift, bits in fields]
+    return torch.stack([floats(words >> shift & mask) / mask for shift, mask in masks], dim=-1)
 
 
 def floats(values: np.ndarray) -> Tensor:

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of, sh_of_colour
+from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of
+from aaplug.io.scenes.packed import sh_of_colour
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
@@ -75,7 +76,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     header = _header(document, first, count)
     with replacing(path, overwrite) as stream:
         stream.write(header.content)
-        document.copy(document.before, stream)
+        stream.write(document.bytes_of(document.before))
         start, written = stream.tell(), 0
         for part in chain([first], parts):
             for at in range(0, len(part), ROWS_PER_WRITE):
@@ -84,7 +85,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
         size = start + written * header.vertex.stride
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
-        document.copy(document.after, stream)
+        stream.write(document.bytes_of(document.after))
         if written != count:  # rows were left out: the number has no more digits than before
             assert written < count
             stream.seek(0)

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from plyfile import PlyData, PlyElement
@@ -18,10 +17,10 @@ from torch import Tensor
 
 from aaplug.io.scenes.ply_header import BIG, LITTLE, TEXT, Header
 from aaplug.io.scenes.rows import read_rows
+from aaplug.io.values import read_part
 from aaplug.system.errors import FormatError
 
 MAX_SPREAD = 16  # rows spread over more than this many times their number are read one by one
-BLOCK_SIZE = 1 << 20  # bytes copied at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +72,12 @@ class Document:
     before: bytes | tuple[int, int] = b""
     after: bytes | tuple[int, int] = b""
 
-    def copy(self, content: bytes | tuple[int, int], stream: BinaryIO) -> None:
-        """Write `before` or `after`."""
+    def bytes_of(self, content: bytes | tuple[int, int]) -> bytes:
+        """`before` or `after`, read; raises FormatError if the file is not there or was cut short."""
         if isinstance(content, bytes):
-            stream.write(content)
-            return
+            return content
         start, stop = content
-        if start == stop:
-            return
-        assert self.table is not None
-        with self.table.path.open("rb") as source:
-            source.seek(start)
-            while start < stop and (data := source.read(min(BLOCK_SIZE, stop - start))):
-                stream.write(data)
-                start += len(data)
+        return read_part(Path(self.header.path), start, stop - start) if start < stop else b""
 
 
 def stamp_of(path: Path) -> tuple[int, int]:

@@ -44,7 +44,7 @@ from aaplug.io.scenes.packed import (
 from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
-from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
+from aaplug.io.values import Entry, natural, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
 
 META = "meta.json"
@@ -53,6 +53,7 @@ ZIP_SIGNATURE = b"PK\x03\x04"
 PALETTE_ROW = 64  # entries
 MAX_PALETTE_PIXELS = PALETTE_ROW * 15 * (1 << 10)  # 64 entries of 15 coefficients in each of 1024 rows
 MOST_DEGREE = 3
+MAX_COUNT = 1 << 40  # Gaussians: more is nonsense
 LEVELS = 256  # of a codebook
 MAX_PALETTE = 1 << 16  # entries: labels have two bytes
 WEBP_EFFORT, WEBP_METHOD = 50, 4  # of 100 and 6: a tenth larger than the most, in a tenth of the time
@@ -130,11 +131,9 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
     root = object_of(meta, path, META, "means, scales, quats and sh0")
     version = root.fields.get("version", 1)
     root.place.expect(version in (1, 2) and (version == 2) == ("version" in meta), "version", "2, or left out", version)
-    value = root.get("count", number) if version > 1 else root.entry("means").fields.get("shape", [0])
+    value = root.value("count") if version > 1 else root.entry("means").fields.get("shape", [0])
     value = value[0] if isinstance(value, list) and value else value
-    if not isinstance(value, int | float) or value < 0 or value != int(value):
-        raise root.place.wrong("count", "a whole number", value)
-    count = int(value)
+    count = natural(value, root.place, "count", MAX_COUNT)
     check_count(path, count)
     used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
     parts = {key: _part(path, root, key, count, fetch) for key in used}

@@ -12,8 +12,7 @@ import torch
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.columns import sh_of_colour
-from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, sh_of_colour
 from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene

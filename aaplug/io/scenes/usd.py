@@ -27,12 +27,11 @@ from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file
 from aaplug.io.cameras.usd import module
-from aaplug.io.scenes.columns import logit_of
-from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
+from aaplug.io.scenes.packed import floats, half_turn_about_z, logit_of, of_degree, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.values import Entry, Place, entries, object_of, parse_json, text
+from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, text
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.locks import scratch
@@ -118,10 +117,8 @@ def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
-    place, degree = Place(path, f"prim {prim.value('name')}"), prim.value("degree")
-    right = isinstance(degree, int) and 0 <= degree <= MAX_DEGREE
-    place.expect(right, DEGREE, f"a whole number from 0 to {MAX_DEGREE}", degree)
-    each = (degree + 1) ** 2
+    place = Place(path, f"prim {prim.value('name')}")
+    each = (natural(prim.value("degree"), place, DEGREE, MAX_DEGREE) + 1) ** 2
 
     def column(name: str, width: int, rows: int | None = None) -> Tensor:
         key = f"{number} {name}"
