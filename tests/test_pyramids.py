@@ -27,7 +27,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.pyramid_folder import MANIFEST, hash_of, pyramid_of, read_manifest, read_pyramid
+from aaplug.io.scenes.pyramid_folder import MANIFEST, hash_of, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merge_in_chunks
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
@@ -201,7 +201,8 @@ def test_between_two_levels_an_image_is_about_as_close_to_the_scene_as_with_eith
     scene, view = sample_scene[::4], sample_cameras.test[0]
     cameras = CameraSet(sample_cameras.train[::4], (view,))
     made = lod(scene, cameras, levels=2, refine=False)
-    fast = Renderer.of(pyramid_of(made), cameras, quality="fast")
+    pyramid = Pyramid.of([level.scene for level in made], [level.chunks for level in made])
+    fast = Renderer.of(pyramid, cameras, quality="fast")
     best = Renderer.of(scene, cameras, quality="best")
     psnrs = [psnr(fast(view.scaled(rate)).rgb, best(view.scaled(rate)).rgb) or 0.0 for rate in (0.5, 0.43, 0.374)]
     assert psnrs[1] > min(psnrs[0], psnrs[2]) - 1

@@ -179,7 +179,7 @@ def read_scene(
     if manifest is not None:
         others = (given / MANIFEST, *(given / level.file for level in manifest.levels[1:]))
         notes = (*scene.notes, manifest.described)
-        return replace(scene, folder=given, read_levels=read_pyramid, others=others, notes=notes)
+        return replace(scene, folder=given, read_levels=partial(read_pyramid, given), others=others, notes=notes)
     return scene
 
 

@@ -97,8 +97,8 @@ class ChunkedFormat:
         def load(start: int, stop: int) -> Gaussians:
             return self.turned(rows_of(pieces, degree, start, stop))
 
-        said = {"convention": first.convention, "fused": first.fused, "flat": first.flat, "others": others}
-        return Scene(path, self.name, count, degree, load, first.evidence, notes=notes, **said)
+        facts = first.evidence, first.convention, first.fused, first.flat
+        return Scene(path, self.name, count, degree, load, *facts, notes=notes, others=others)
 
 
 def _nodes(root: Entry, children: str) -> Iterator[tuple[Entry, bool]]:

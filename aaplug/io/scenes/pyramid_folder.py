@@ -9,7 +9,7 @@ but the finest, which keeps the scene's order, lie chunk by chunk.
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -73,12 +73,6 @@ class Level(NamedTuple):
     parents: Int[Tensor, " m"] | None = None
 
 
-def pyramid_of(levels: Sequence[Level]) -> Pyramid:
-    """The pyramid of these levels, the finest first."""
-    chunks = [level.chunks for level in levels if level.chunks is not None]
-    return Pyramid.of([level.scene for level in levels], chunks)
-
-
 def is_pyramid(folder: AnyPath) -> bool:
     """True for a folder that holds a pyramid, finished or not."""
     return (Path(folder) / MANIFEST).is_file()
@@ -115,7 +109,8 @@ def read_pyramid(folder: AnyPath) -> Pyramid:
     Raises:
         FormatError: lod.json or a level is missing, broken, or not what it should be.
     """
-    return pyramid_of(list(levels_in(folder, read_manifest(folder))))
+    levels = list(levels_in(folder, read_manifest(folder)))
+    return Pyramid.of([level.scene for level in levels], [c for level in levels if (c := level.chunks) is not None])
 
 
 def levels_in(folder: AnyPath, manifest: Manifest, start: int = 0) -> Iterator[Level]:

@@ -83,7 +83,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     other: "Scene | None" = None
     folder: Path | None = None
-    read_levels: Callable[[Path], Pyramid] | None = field(default=None, repr=False)
+    read_levels: Callable[[], Pyramid] | None = field(default=None, repr=False)
     frames: "SceneFrames | None" = None
     others: tuple[Path, ...] = ()
     drop_bad: bool = False
@@ -175,7 +175,7 @@ class Scene:
     def levels(self) -> Pyramid | None:
         """All levels of detail, read once; None if there is but one.  Raises FormatError if a level is broken."""
         if "levels" not in self.memory:
-            self.memory["levels"] = self.folder and self.read_levels and self.read_levels(self.folder)
+            self.memory["levels"] = self.read_levels and self.read_levels()
         return self.memory["levels"]
 
     def gaussians(self) -> Gaussians:
