@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, numbered
 
 NEIGHBOURS = 6  # cameras nearest to each, between which and itself its free views lie
 LEAST_SHARE, LARGEST_SHARE = 0.2, 0.8  # of the way to the neighbour
@@ -68,8 +68,7 @@ def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
 
 def frames(path: Callable[[float], Camera], count: int) -> list[Camera]:
     """`count` cameras along a path, named by their number."""
-    digits = len(str(count - 1))
-    return [replace(path(i / count), name=f"{i:0{digits}}") for i in range(count)]
+    return [replace(path(i / count), name=name) for i, name in enumerate(numbered(count))]
 
 
 def free_views(cameras: Sequence[Camera], each: int, seed: int = 0) -> list[Camera]:

@@ -288,6 +288,11 @@ def whole_side(length: float) -> int:
     return max(1, math.floor(length + WHOLE_SLACK))
 
 
+def numbered(count: int, before: str = "") -> list[str]:
+    """Names that end in a number, from 0 and of one length."""
+    return [f"{before}{number:0{len(str(count - 1))}}" for number in range(count)]
+
+
 def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
     """At most this many of the views, evenly spaced."""
     return views[:: max(1, -(-len(views) // most))]

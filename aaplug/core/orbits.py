@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, centred, look_at
+from aaplug.core.cameras import Camera, centred, look_at, numbered
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.rules import NEAR
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, even_directions, sh_colour
@@ -99,12 +99,11 @@ def orbit(
     distance = frame.distance(fov)
     focal, side = frame.focal(distance) * min(size), torch.linalg.cross(frame.up, frame.front)
     views = []
-    for index in range(count):
+    for index, named in enumerate(numbered(count, f"{name}_")):
         turn = 2 * math.pi * index / count
         level = math.cos(turn) * frame.front + math.sin(turn) * side
         eye = frame.centre + distance * (math.cos(elevation) * level + math.sin(elevation) * frame.up)
-        pose = look_at(eye, frame.centre, frame.up)
-        views.append(centred(f"{name}_{index:0{len(str(count - 1))}}", size, focal, pose))
+        views.append(centred(named, size, focal, look_at(eye, frame.centre, frame.up)))
     return tuple(views)
 
 

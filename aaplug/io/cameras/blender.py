@@ -6,8 +6,8 @@ from pathlib import Path
 
 from aaplug.core.cameras import CameraSet
 from aaplug.io.cameras import transforms
-from aaplug.io.cameras.sets import CameraFileOptions, explicit
-from aaplug.io.cameras.transforms import Source, read_source, set_of, trained
+from aaplug.io.cameras.sets import CameraFileOptions
+from aaplug.io.cameras.transforms import Source, read_source, set_of
 from aaplug.system.errors import UsageError
 
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
@@ -29,8 +29,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         raise UsageError("test_every", f"{path / TEST} gives the split; leave it out")
     else:
         train, test = (read_source(path / file, options) for file in (TRAIN, TEST))
-        split = explicit(trained(train, options), trained(test, options), f"{TRAIN} and {TEST}")
-        notes = tuple(dict.fromkeys(train.notes + test.notes))
-        cameras = set_of(Source((*train.cameras, *test.cameras), notes=notes), split, options)
+        held_out = [False] * len(train.cameras) + [True] * len(test.cameras)
+        both = Source(train.cameras + test.cameras, held_out, tuple(dict.fromkeys(train.notes + test.notes)))
+        cameras = set_of(both, options, f"{TRAIN} and {TEST}")
     more = (f"{VAL} is not read",) if os.path.isfile(path / VAL) else ()
     return replace(cameras, notes=cameras.notes + more)

@@ -11,10 +11,10 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred
+from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
-from aaplug.io.cameras.sets import CameraFileOptions, described_sizes, file_sizes, undivided
+from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, undivided
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError, counted
 
@@ -51,9 +51,9 @@ def sniff(path: Path) -> bool:
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training."""
     refuse_folder(options)
-    cameras = [replace(camera, exposure=None) for camera in path_of(path).cameras]
-    sizes, _ = file_sizes(cameras, options)
-    cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
+    source = [replace(camera, exposure=None) for camera in path_of(path).cameras]
+    sized, _ = at_file_size(source, options)
+    cameras = [replace(new, trained_focal=old.trained_focal) for new, old in zip(sized, source, strict=True)]
     split = undivided(cameras, "a path has no split")
     what = f"camera path: {counted(len(cameras), 'free camera')}, {described_sizes(cameras)}"
     note = f"{what}; used in place of training cameras, which would give better sampling bounds"
@@ -69,10 +69,10 @@ def path_of(path: Path) -> CameraPath:
     fps = about.get("fps", number, DEFAULT_FPS)
     about.place.expect(fps > 0, "fps", "above 0", fps)
     frames = entries(path, "frame", about.fields[KEY])
-    digits = len(str(len(frames) - 1))
     shutter = about.get("shutter", number) if about.fields.get("shutter") is not None else None
     about.place.expect(shutter is None or 0 < shutter <= 1, "shutter", "above 0, at most 1", shutter)
-    return CameraPath(tuple(_camera(entry, f"{i:0{digits}}", size) for i, entry in enumerate(frames)), fps, shutter)
+    named = zip(frames, numbered(len(frames)), strict=True)
+    return CameraPath(tuple(_camera(entry, name, size) for entry, name in named), fps, shutter)
 
 
 def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:

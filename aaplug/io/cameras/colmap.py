@@ -61,9 +61,9 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     more = [*photos.notes(source), *_other_models(folder)]
     names = distinct(images_file, [image.name for image in images], (without_suffix, str))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
-    sizes, why = sets.photo_sizes_or_scaled(source, options)
+    trained, why = sets.at_photo_size(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
-    trained = cameras_of_photographs(sets.trained_at(source, sizes), lenses, options.undistort)
+    trained = cameras_of_photographs(trained, lenses, options.undistort)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
     more += lens_notes(lenses, trained, options.undistort)

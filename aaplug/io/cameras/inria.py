@@ -50,8 +50,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     short = [without_suffix(camera.name) for camera in source]
     if len({*short}) == len({camera.name for camera in source}):
         source = [replace(camera, name=name) for camera, name in zip(source, short, strict=True)]
-    sizes, why = _training_sizes(source, settings, options)
-    split = _split(sets.trained_at(source, sizes), settings, options)
+    trained, why = _trained(source, settings, options)
+    split = _split(trained, settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
     more = []
     if settings and settings.source and not photographs(source):
@@ -86,12 +86,12 @@ def _camera(entry: Entry) -> Camera:
     return replace(centred(entry.get("img_name", text), size, fx, cam_from_world), fy=fy)
 
 
-def _training_sizes(
+def _trained(
     cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions
-) -> tuple[list[sets.Size], str]:
-    """3DGS's rule, applied to the sizes of the photos that training loaded; and the reason, for a note."""
+) -> tuple[list[Camera], str]:
+    """The cameras at 3DGS's sizes, by its rule, of the photos that training loaded; and why, for a note."""
     if options.train_scale is not None:
-        return sets.file_sizes(cameras, options)
+        return sets.at_file_size(cameras, options)
     run = settings or CfgArgs()
     n = run.divisor
     if any(camera.photo for camera in cameras):
@@ -102,7 +102,7 @@ def _training_sizes(
     rule = f"resolution {run.resolution:g} in cfg_args"
     if settings is None:
         rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: `train_scale` sets it"
-    return [run.size(*size) for size in loaded], f"{why}, {rule}"
+    return sets.trained_at(cameras, [run.size(*size) for size in loaded]), f"{why}, {rule}"
 
 
 def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> sets.Split:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.cameras import WHOLE_SLACK, Camera, centred
+from aaplug.core.cameras import WHOLE_SLACK, Camera, centred, numbered
 from aaplug.io.cameras.poses import inverse
 from aaplug.io.values import Place, focal
 
@@ -82,9 +82,8 @@ def cameras_of(
 
     world_from_cam: rigid, OpenCV axes.  tangents: of half the angle of view along the side that `side` picks.
     """
-    digits = len(str(len(tangents) - 1))
     cameras = []
-    for index, (pose, tangent) in enumerate(zip(world_from_cam, tangents.tolist(), strict=True)):
+    for name, pose, tangent in zip(numbered(len(tangents)), world_from_cam, tangents.tolist(), strict=True):
         f = focal(side(size) / 2 / tangent if tangent else math.inf, place, "the focal length")
-        cameras.append(centred(f"{index:0{digits}}", size, f, inverse(pose, place, "the position")))
+        cameras.append(centred(name, size, f, inverse(pose, place, "the position")))
     return tuple(cameras)

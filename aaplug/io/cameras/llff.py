@@ -51,8 +51,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
     uneven = f"photos: {folder.folder.name} holds {photos} and the file {len(rows)} poses, so none is used"
     more = folder.notes(source) if photos in (0, len(rows)) else [uneven]
-    sizes, why = sets.photo_sizes_or_scaled(source, options)
-    trained = sets.trained_at(source, sizes)
+    trained, why = sets.at_photo_size(source, options)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return sets.camera_set(f"LLFF {FILE}", source, split, why, more=more)
 

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import WHITE
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
-from aaplug.io.cameras.sets import CameraFileOptions, described_sizes, explicit, file_sizes, trained_at, undivided
+from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, explicit, undivided
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
 from aaplug.system.errors import UsageError, counted
 
@@ -37,7 +37,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     file = path / FILE if os.path.isdir(path) else path
     document = object_of(read_json(file), file, "it", "'train', as multi-scale Blender datasets have", "train")
     train, test = (_cameras(document, split) if split in document else [] for split in ("train", "test"))
-    trained, held_out = (trained_at(views, file_sizes(views, options)[0]) for views in (train, test))
+    trained, held_out = (at_file_size(views, options)[0] for views in (train, test))
     split = explicit(trained, held_out, FILE) if held_out else undivided(trained, f"no test in {FILE}")
     what = f"multi-scale Blender: {counted(len(train) + len(test), 'camera')}, {described_sizes(train)}"
     size = "training size: each photo's own, as all scales were trained on"

@@ -6,10 +6,10 @@ world_to_camera is 4×4, row by row, OpenCV axes.
 
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, numbered
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose, rigid
-from aaplug.io.cameras.sets import CameraFileOptions, camera_set, every_nth, file_sizes, trained_at
+from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
 from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
 
 name = "pinhole"
@@ -27,11 +27,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     document = read_json(path)
     alone = isinstance(document, dict)
     items = entries(path, "camera", [document] if alone else document)
-    digits = len(str(len(items) - 1))
-    names = [path.stem] if alone else [f"camera_{i:0{digits}}" for i in range(len(items))]
+    names = [path.stem] if alone else numbered(len(items), "camera_")
     source = [_camera(item, name) for item, name in zip(items, names, strict=True)]
-    sizes, why = file_sizes(source, options)
-    split = every_nth(trained_at(source, sizes), options, 0, "the format has no split")
+    trained, why = at_file_size(source, options)
+    split = every_nth(trained, options, 0, "the format has no split")
     return camera_set("pinhole JSON", source, split, why)
 
 

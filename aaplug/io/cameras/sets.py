@@ -81,24 +81,24 @@ def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int
     return explicit(train, cameras[::n], f"1 in {n} by name: {source}")
 
 
-def file_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
-    """Each camera's size in the file, times `train_scale` if the user chose one; and the reason, for a note."""
+def at_file_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Camera], str]:
+    """The cameras trained at their size in the file, times `train_scale` if the user chose one; and why, for a note."""
     scale = options.train_scale
     sizes = [_scaled(camera, 1.0 if scale is None else scale) for camera in cameras]
     most = whole_limit("CAMERA_SIDE")
     if max(map(max, sizes), default=0) > most:
         raise UsageError("train_scale", f"makes an image of more than {most} px a side")
-    why = "size in the file"
-    return sizes, f"{why}{_uncapped(sizes)}" if scale is None else f"{why} × {scale:g}: `train_scale`"
+    why = _uncapped(sizes) if scale is None else f" × {scale:g}: `train_scale`"
+    return trained_at(cameras, sizes), f"size in the file{why}"
 
 
-def photo_sizes_or_scaled(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
-    """The sizes of the cameras' photos, unless the user chose `train_scale`; and the reason, for a note."""
+def at_photo_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Camera], str]:
+    """The cameras trained at the size of their photos, unless the user chose `train_scale`; and why, for a note."""
     if options.train_scale is not None:
-        return file_sizes(cameras, options)
+        return at_file_size(cameras, options)
     there, sizes = len(photographs(cameras)), photo_sizes(cameras)
     why = f"size of the {counted(there, 'photo')} found" if there else "size in the file, no photos found"
-    return sizes, why + _uncapped(sizes)
+    return trained_at(cameras, sizes), why + _uncapped(sizes)
 
 
 def _uncapped(sizes: Sequence[Size]) -> str:

@@ -57,7 +57,7 @@ class Source:
     """The cameras of a file.  held_out: true for each that is a test view, None if the file does not say."""
 
     cameras: tuple[Camera, ...]
-    held_out: tuple[bool, ...] | None = None
+    held_out: Sequence[bool] | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -73,28 +73,27 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of one file."""
     file = path / FILE if os.path.isdir(path) else path
     source = read_source(file, options)
-    cameras = trained(source, options)
+    return set_of(source, options, "lists of file names" if source.held_out else f"only {file.name} read")
+
+
+def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet:
+    """The set of the source's cameras; photos with alpha mean a white background, Blender's custom.
+
+    reason: of the split that the source has, or of none.
+    """
+    cameras, why = sets.at_file_size(source.cameras, options)
     if source.held_out is not None and options.test_every is None:
         pairs = list(zip(cameras, source.held_out, strict=True))
         train, test = ([camera for camera, out in pairs if out == held] for held in (False, True))
-        return set_of(source, sets.explicit(train, test, "lists of file names"), options)
-    if options.test_every:
-        cameras = sorted(cameras, key=lambda camera: camera.name)
-    return set_of(source, sets.every_nth(cameras, options, 0, f"only {file.name} read"), options)
-
-
-def set_of(source: Source, split: sets.Split, options: CameraFileOptions) -> CameraSet:
-    """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
+        split = sets.explicit(train, test, reason)
+    else:
+        cameras = sorted(cameras, key=lambda camera: camera.name) if options.test_every else cameras
+        split = sets.every_nth(cameras, options, 0, reason)
     headers = (read_start(camera.photo, PNG_COLOUR_TYPE + 1) for camera in source.cameras if camera.photo)
     alpha = any(h.startswith(PNG_SIGNATURE) and h[PNG_COLOUR_TYPE:] in PNG_ALPHA for h in headers)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
-    why, background = sets.file_sizes(source.cameras, options)[1], WHITE if alpha else None
+    background = WHITE if alpha else None
     return sets.camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
-
-
-def trained(source: Source, options: CameraFileOptions) -> list[Camera]:
-    """The source's cameras at their training size."""
-    return sets.trained_at(source.cameras, sets.file_sizes(source.cameras, options)[0])
 
 
 def read_source(file: Path, options: CameraFileOptions) -> Source:
@@ -156,7 +155,7 @@ def _dataparser(path: Path) -> Dataparser | None:
     return pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale
 
 
-def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
+def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> list[bool] | None:
     """True for each frame that nerfstudio's lists of file names keep from training; None without lists."""
     lists, frames = dict[str, set[str]](), set(paths)
     place = object_of(document, file, "lists of file names", "frames").place
@@ -170,7 +169,7 @@ def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tup
     if not lists:
         return None
     train = lists.get(FILE_LISTS[0], frames.difference(*lists.values()))
-    return tuple(path not in train for path in paths)
+    return [path not in train for path in paths]
 
 
 def _plain(path: str) -> str:

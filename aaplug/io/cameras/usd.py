@@ -8,14 +8,13 @@ before the stage is composed.
 
 import math
 import os
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from aaplug.core.cameras import WHOLE_SLACK, Aperture, Camera, Exposure
+from aaplug.core.cameras import WHOLE_SLACK, Aperture, Camera, Exposure, numbered
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
@@ -67,11 +66,10 @@ def _read(path: Path) -> CameraPath:
         times = [Usd.TimeCode(first + step * codes / fps) for step in range(math.floor(steps + WHOLE_SLACK) + 1)]
     elif moving:
         raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
-    digits = len(str(len(times) - 1))
-    cameras = [_camera(camera, time, place) for time in times]
-    named = tuple(replace(view, name=f"{i:0{digits}}") for i, (view, _) in enumerate(cameras))
-    shutter = cameras[0][1] * fps / codes
-    return CameraPath(named, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
+    named = zip(numbered(len(times)), times, strict=True)
+    cameras, shutters = zip(*(_camera(name, camera, time, place) for name, time in named), strict=True)
+    shutter = shutters[0] * fps / codes
+    return CameraPath(cameras, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
 
 
 def module(name: str) -> Any:
@@ -109,11 +107,11 @@ def _moves(camera: Any) -> bool:
     return own
 
 
-def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float]:
+def _camera(name: str, camera: Any, time: Any, place: Place) -> tuple[Camera, float]:
     """The camera at a time, and its shutter in time codes."""
 
-    def value(name: str) -> float:
-        return number(getattr(camera, f"Get{name}Attr")().Get(time), place, name)
+    def value(field: str) -> float:
+        return number(getattr(camera, f"Get{field}Attr")().Get(time), place, field)
 
     kind = camera.GetProjectionAttr().Get(time)
     place.expect(kind == "perspective", "projection", "perspective", kind)
@@ -134,7 +132,7 @@ def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float]:
     shutter = value("ShutterClose") - value("ShutterOpen")
     try:
         aperture = Exposure(Aperture(length / UNIT / stop / 2, focus)) if stop > 0 and focus > 0 else None
-        view = Camera("0", width, height, f, f, cx, cy, pose, exposure=aperture)
+        view = Camera(name, width, height, f, f, cx, cy, pose, exposure=aperture)
     except UsageError as error:
         raise place.error(str(error)) from error
     return view, shutter
