@@ -71,6 +71,7 @@ def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
     assert camera.trained_focal is None
 
 
+FAR = [1, 0, 0, 1e20, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1]
 BROKEN = {
     "no path": ([], "no camera path of a known format"),
     "a fisheye": (document(camera_type="fisheye"), "camera_type should be perspective"),
@@ -78,6 +79,7 @@ BROKEN = {
     "no size": (document(render_width=0), "render_width"),
     "no time": (document(fps=0), "fps should be above 0"),
     "an angle": (document(camera_path=[document()["camera_path"][0] | {"fov": 180}]), "frame 0: fov"),
+    "far away": (document(camera_path=[{"camera_to_world": FAR, "fov": 50}]), "camera 0: .* a translation of at most"),
     "a short pose": (document(camera_path=[{"camera_to_world": [1], "fov": 50}]), "camera_to_world"),
 }  # fmt: skip
 

@@ -16,7 +16,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of
 from aaplug.core.orbits import orbit as orbit_views
 from aaplug.core.sampling import sampling_bounds
-from aaplug.io.cameras import holds_cameras
+from aaplug.io.cameras import recognized
 from aaplug.io.cameras.cfg_args import CAPPED, DIVISORS, NAME, WIDTH_CAP, read_cfg_args
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
@@ -60,7 +60,7 @@ def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> Came
     size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)
     note = f"{TRAINING_RATE}assumed as of {size} px from the orbit, {rate:.4g} px per unit in its middle ({reason})"
     notes = (note, f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})")
-    if path is not None and holds_cameras(path.parent):
+    if path is not None and recognized(path.parent):
         notes = (*notes, f"there are cameras: --cameras {path.parent}")
     return replace(cameras, notes=notes)
 

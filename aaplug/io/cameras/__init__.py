@@ -7,7 +7,8 @@ an entry point in the group "aaplug.camera_formats" (`system.registry`).  `read_
 
 import difflib
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -100,23 +101,15 @@ def read_cameras(
     if not os.path.exists(path):
         raise FormatError(path, "there is no such file or folder")
     path = Path(path)
-    formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
-    for format in formats:
-        if asked("camera format", format, "sniff", path):
-            try:
-                cameras = asked("camera format", format, "read", path, options)
-            except UsageError as error:
-                value = error.__cause__ if isinstance(error, PlugInError) else error
-                if not isinstance(value, UsageError) or not value.where.startswith("camera "):  # but an option
-                    raise
-                raise FormatError(path, str(value)) from error
-            rest = [each for each in formats if path.is_dir() and each.read != format.read]
-            others = [each.sign for each in rest if asked("camera format", each, "sniff", path)]
-            more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
-            return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
+    if found := recognized(path):
+        with of_file(path):
+            cameras = asked("camera format", found[0], "read", path, options)
+        others = [each.sign for each in found if path.is_dir() and each.read != found[0].read]
+        more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
+        return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
     if any(format.sniff(path) for format in PATH_FORMATS):
         raise FormatError(path, "is of a format of camera paths, which `path` of render and video takes")
-    signs = "; ".join(format.sign for format in formats)
+    signs = "; ".join(format.sign for format in CAMERA_FORMATS.values())
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 
 
@@ -130,8 +123,9 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     """
     for format in PATH_FORMATS:
         if format.sniff(Path(path)):
-            return format.path_of(Path(path))
-    if os.path.exists(path) and not holds_cameras(path):
+            with of_file(path):
+                return format.path_of(Path(path))
+    if os.path.exists(path) and not recognized(path):
         raise FormatError(path, "holds no camera path of a known format; `aaplug guide film-camera` lists them")
     try:
         cameras = read_cameras(path, test_every=0)
@@ -140,9 +134,22 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     return CameraPath(tuple(replace(view, trained_focal=None, photo=None, undistortion=None) for view in cameras.all))
 
 
-def holds_cameras(path: str | PathLike[str]) -> bool:
-    """Whether any format recognizes cameras at this path."""
-    return any(asked("camera format", each, "sniff", Path(path)) for each in CAMERA_FORMATS.values())
+def recognized(path: str | PathLike[str]) -> list[CameraFormat]:
+    """The formats of whose cameras there are some at this path, plug-ins first."""
+    formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)
+    return [each for each in formats if asked("camera format", each, "sniff", Path(path))]
+
+
+@contextmanager
+def of_file(path: str | PathLike[str]) -> Iterator[None]:
+    """A block in which an error about a camera's own values is one of this file."""
+    try:
+        yield
+    except UsageError as error:
+        value = error.__cause__ if isinstance(error, PlugInError) else error
+        if not isinstance(value, UsageError) or not value.where.startswith("camera "):  # but an option
+            raise
+        raise FormatError(path, str(value)) from error
 
 
 def select_views(cameras: CameraSet, spec: str, option: str = "views") -> tuple[Camera, ...]:

@@ -57,7 +57,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     split = undivided(cameras, "a path has no split")
     what = f"camera path: {counted(len(cameras), 'free camera')}, {described_sizes(cameras)}"
     note = f"{what}; used in place of training cameras, which would give better sampling bounds"
-    return CameraSet(split.train, split.test, notes=(note, split.note))
+    return replace(split, notes=(note, *split.notes))
 
 
 def path_of(path: Path) -> CameraPath:
@@ -80,8 +80,7 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
     entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
     f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-    world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")
-    cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
+    cam_from_world = inverse(pose_of_opengl(motion, entry.place, "camera_to_world"))
     exact = {
         field: entry.get(key, number if key in ("cx", "cy") else focal)
         for key, field in EXACT.items()

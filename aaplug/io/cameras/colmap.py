@@ -19,7 +19,7 @@ from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
-from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.poses import pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
 from aaplug.io.values import Place, focal, number, pixels
@@ -112,7 +112,6 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
     image.place.expect(usable, "quaternion", "finite and not zero", image.quaternion)
     turn = rotation_matrices(torch.tensor([image.quaternion], dtype=torch.float64) / length)[0]
     cam_from_world = pose(turn, torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
-    inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 
 

@@ -109,8 +109,7 @@ def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -
 def _sampled(channel: Channel, at: Float[Tensor, " f"], place: Place, turns: bool) -> Float[Tensor, "f c"]:
     """The values of a channel; quaternions xyzw if it turns."""
     times, values, way = channel
-    index, share = segments(times, at)
-    after = (index + 1).clamp(max=len(times) - 1)
+    index, after, share = segments(times, at)
     if way == "CUBICSPLINE":
         into, values, out = values.view(len(times), 3, -1).unbind(dim=1)
         width = (times[after] - times[index])[:, None]

@@ -82,7 +82,7 @@ def _camera(entry: Entry) -> Camera:
     rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
     size = entry.get("width", pixels), entry.get("height", pixels)
     fx, fy = entry.get("fx", focal), entry.get("fy", focal)
-    cam_from_world = inverse(pose(rotation, position, entry.place, "rotation"), entry.place, "position")
+    cam_from_world = inverse(pose(rotation, position, entry.place, "rotation"))
     return replace(centred(entry.get("img_name", text), size, fx, cam_from_world), fy=fy)
 
 
@@ -105,7 +105,7 @@ def _trained(
     return sets.trained_at(cameras, [run.size(*size) for size in loaded]), f"{why}, {rule}"
 
 
-def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> sets.Split:
+def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> CameraSet:
     """The split by name, or by order where the names begin again: Blender's test views r_0, ..., then training's."""
     held_out = settings is not None and settings.held_out
     counts, occurrences = Counter[str](), list[int]()

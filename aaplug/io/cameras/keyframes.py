@@ -33,12 +33,14 @@ def rising(times: Float[Tensor, " n"], place: Place) -> Float[Tensor, " n"]:
     return times
 
 
-def segments(times: Float[Tensor, " n"], at: Float[Tensor, " f"]) -> tuple[Int[Tensor, " f"], Float[Tensor, " f"]]:
-    """The key before each time and the share of the way to the next; beyond the ends, the end."""
+def segments(
+    times: Float[Tensor, " n"], at: Float[Tensor, " f"]
+) -> tuple[Int[Tensor, " f"], Int[Tensor, " f"], Float[Tensor, " f"]]:
+    """The keys before and after each time, and the share of the way between them; beyond the ends, the end."""
     if len(times) == 1:
-        return torch.zeros(len(at), dtype=torch.int64), torch.zeros_like(at)
+        return torch.zeros(len(at), dtype=torch.int64), torch.zeros(len(at), dtype=torch.int64), torch.zeros_like(at)
     index = (torch.searchsorted(times, at, right=True) - 1).clamp(0, len(times) - 2)
-    return index, ((at - times[index]) / (times[index + 1] - times[index])).clamp(0.0, 1.0)
+    return index, index + 1, ((at - times[index]) / (times[index + 1] - times[index])).clamp(0.0, 1.0)
 
 
 def hermite(
@@ -85,5 +87,5 @@ def cameras_of(
     cameras = []
     for name, pose, tangent in zip(numbered(len(tangents)), world_from_cam, tangents.tolist(), strict=True):
         f = focal(side(size) / 2 / tangent if tangent else math.inf, place, "the focal length")
-        cameras.append(centred(name, size, f, inverse(pose, place, "the position")))
+        cameras.append(centred(name, size, f, inverse(pose)))
     return tuple(cameras)

@@ -49,10 +49,9 @@ def path_of(path: Path) -> CameraPath:
         key.place.expect(easing in range(len(EASINGS)), "easing", f"0 to {len(EASINGS) - 1}", easing)
         key.place.expect(focal > 0, "focal_length_mm", "above 0", focal)
     at = frame_times(float(times[0]), float(times[-1]), FPS, about.place)
-    index, share = segments(times, at)
+    index, after, share = segments(times, at)
     eased = torch.stack([ease(share) for ease in EASINGS])
     share = eased[torch.tensor(easings, dtype=torch.int64)[index], torch.arange(len(at))]
-    after = (index + 1).clamp(max=len(keys) - 1)
     padded = torch.cat([places[:1], places, places[-1:]])
     slopes = (padded[2:] - padded[:-2]) / 2
     points = hermite(places[index], slopes[index], slopes[after], places[after], share)

@@ -77,4 +77,4 @@ def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
     f = focal(matrix[2, 4].item(), place, "focal length")
     down, right, back = matrix[:, :3].unbind(dim=1)
     world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
-    return centred(name, (width, height), f, inverse(world_from_cam, place, "position"))
+    return centred(name, (width, height), f, inverse(world_from_cam))

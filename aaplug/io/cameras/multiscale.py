@@ -6,6 +6,7 @@ its own size.
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, centred
@@ -41,7 +42,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     split = explicit(trained, held_out, FILE) if held_out else undivided(trained, f"no test in {FILE}")
     what = f"multi-scale Blender: {counted(len(train) + len(test), 'camera')}, {described_sizes(train)}"
     size = "training size: each photo's own, as all scales were trained on"
-    return CameraSet(split.train, split.test, WHITE, (what, split.note, size, "background: white, Blender's custom"))
+    notes = what, *split.notes, size, "background: white, Blender's custom"
+    return replace(split, background=WHITE, notes=notes)
 
 
 def _cameras(document: Entry, split: str) -> list[Camera]:
@@ -56,8 +58,7 @@ def _cameras(document: Entry, split: str) -> list[Camera]:
     names = distinct(file, paths, (last_part, without_suffix, str))
     folder, cameras = PhotoFolder(file.parent, file.parent), list[Camera]()
     for item, name, photo in zip(items, names, paths, strict=True):
-        world_from_cam = pose_of_opengl(rigid(item, "cam2world"), item.place, "cam2world")
         size, f = (item.get("width", pixels), item.get("height", pixels)), item.get("focal", focal)
-        cam_from_world = inverse(world_from_cam, item.place, "cam2world")
+        cam_from_world = inverse(pose_of_opengl(rigid(item, "cam2world"), item.place, "cam2world"))
         cameras.append(centred(name, size, f, cam_from_world, folder.find(photo, item.place)))
     return cameras

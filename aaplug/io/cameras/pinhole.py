@@ -8,7 +8,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, numbered
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import inverse, pose, rigid
+from aaplug.io.cameras.poses import pose, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
 from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
 
@@ -37,7 +37,6 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
 def _camera(entry: Entry, name: str) -> Camera:
     motion = rigid(entry, "world_to_camera")
     cam_from_world = pose(motion[:3, :3], motion[:3, 3], entry.place, "world_to_camera")
-    inverse(cam_from_world, entry.place, "world_to_camera")  # refuses a centre that overflows
     width, height = entry.get("width", pixels), entry.get("height", pixels)
     fx, fy, cx, cy = entry.get("fx", focal), entry.get("fy", focal), entry.get("cx", number), entry.get("cy", number)
     return Camera(name, width, height, fx, fy, cx, cy, cam_from_world)

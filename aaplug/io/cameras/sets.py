@@ -6,7 +6,7 @@ for a photo that cannot be read or whose aspect differs from its camera's.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
@@ -45,27 +45,19 @@ class CameraFileOptions:
             raise UsageError("test_every", f"should be 0 (no split), 2 or more, not {every}")
 
 
-@dataclass(frozen=True)
-class Split:
-    """Training and test views, and a note on where the split came from."""
-
-    train: tuple[Camera, ...]
-    test: tuple[Camera, ...]
-    note: str
+def explicit(train: Sequence[Camera], test: Sequence[Camera], source: str) -> CameraSet:
+    """A split that the files give, with a note on where it came from."""
+    return CameraSet((*train,), (*test,), notes=(f"split: {len(train)} train, {len(test)} test ({source})",))
 
 
-def explicit(train: Sequence[Camera], test: Sequence[Camera], source: str) -> Split:
-    """A split that the files give."""
-    return Split(tuple(train), tuple(test), f"split: {len(train)} train, {len(test)} test ({source})")
-
-
-def undivided(cameras: Sequence[Camera], source: str) -> Split:
-    """No split: every camera is both a training and a test view."""
+def undivided(cameras: Sequence[Camera], source: str) -> CameraSet:
+    """No split: every camera is both a training and a test view; with a note on why."""
     views = tuple(cameras)
-    return Split(views, views, f"split: none, {counted(len(views), 'camera')} for both training and test ({source})")
+    note = f"split: none, {counted(len(views), 'camera')} for both training and test ({source})"
+    return CameraSet(views, views, notes=(note,))
 
 
-def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int, source: str) -> Split:
+def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int, source: str) -> CameraSet:
     """Every n-th camera, beginning with the first, is a test view.
 
     custom: n if `options` do not give it, for the reason `source`; 0 for no split.
@@ -137,18 +129,18 @@ def described_sizes(cameras: Sequence[Camera]) -> str:
 def camera_set(
     kind: str,
     source: Sequence[Camera],
-    split: Split,
+    split: CameraSet,
     why: str,
     background: tuple[float, float, float] | None = None,
     more: Sequence[str] = (),
 ) -> CameraSet:
-    """The set of a split of cameras, with notes on format, split and training size.
+    """A split with notes on format and training size beside its own.
 
     source: the cameras as the file has them.  why: where the training size came from.  more: notes to add.
     """
     format = f"{kind}: {counted(len(source), 'camera')}, {described_sizes(source)} in the file"
     size = f"training size: {described_sizes([*split.train, *split.test])} ({why})"
-    return CameraSet(split.train, split.test, background, (format, split.note, size, *more))
+    return replace(split, background=background, notes=(format, *split.notes, size, *more))
 
 
 def _scaled(camera: Camera, scale: float) -> Size:

@@ -50,8 +50,7 @@ def path_of(path: Path) -> CameraPath:
     if track.fields.get("loopMode") == "repeat" and inside.sum() > 1:  # between copies a round earlier and later
         times, values = times[inside], values[inside].repeat(3, 1)
         times = torch.cat([times - frames, times, times + frames])
-    index, share = segments(times, at)
-    after = (index + 1).clamp(max=len(times) - 1)
+    index, after, share = segments(times, at)
     if track.fields.get("interpolation") == "step":
         values = values[index]
     else:

@@ -190,8 +190,7 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
     if parser is not None:
         world_from_cam = parser[0] @ world_from_cam
         world_from_cam[:3, 3] *= parser[1]
-    cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
-    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
+    return Camera(name, width, height, fx, fy, cx, cy, inverse(world_from_cam), photo=photo)
 
 
 def _intrinsics(entry: Entry, width: int, height: int) -> tuple[float, float, float, float]:

@@ -127,7 +127,7 @@ def _camera(name: str, camera: Any, time: Any, place: Place) -> tuple[Camera, fl
     motion = torch.tensor(rows, dtype=torch.float64).T
     motion[:3, :3] /= motion[:3, :3].norm(dim=0)
     place.expect(bool(motion.isfinite().all()), "its transform", "finite", rows)
-    pose = inverse(pose_of_opengl(motion, place, "its transform"), place, "its position")
+    pose = inverse(pose_of_opengl(motion, place, "its transform"))
     stop, focus = value("FStop"), value("FocusDistance")
     shutter = value("ShutterClose") - value("ShutterOpen")
     try:

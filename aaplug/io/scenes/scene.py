@@ -25,7 +25,7 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.io import STREAM_INDEXES
-from aaplug.io.cameras import holds_cameras, read_cameras
+from aaplug.io.cameras import read_cameras, recognized
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
 from aaplug.io.scenes.rows import check_count, library_errors
@@ -164,7 +164,7 @@ class Scene:
         if path is None:
             return None
         folder = Path(os.path.normpath(path.parent / "../..")) if path.absolute().match(MODEL_SCENE) else path
-        return folder if folder.is_dir() and holds_cameras(folder) else None
+        return folder if folder.is_dir() and recognized(folder) else None
 
     @property
     def cameras(self) -> CameraSet | None:
