@@ -18,13 +18,13 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def test_a_zoom_goes_from_start_to_end_and_back_in_octaves():
-    ways = [paths.zoom(VIEW, t, 1.0, 0.25).fx / VIEW.fx for t in (0.0, 0.25, 0.5, 0.75)]
-    assert ways == pytest.approx([1.0, 0.5, 0.25, 0.5])
-    assert paths.zoom(VIEW, 0.3, 1.0, 0.25).hw == VIEW.hw
+    views = [paths.zoomed(VIEW, paths.factor(t, 1.0, 0.25)) for t in (0.0, 0.25, 0.5, 0.75)]
+    assert [view.fx / VIEW.fx for view in views] == pytest.approx([1.0, 0.5, 0.25, 0.5])
+    assert {view.hw for view in views} == {VIEW.hw}
 
 
 def test_a_dolly_moves_along_the_axis_and_keeps_the_focal_length():
-    far = paths.dolly(VIEW, 0.5, 1.0, 0.25, depth=4.0)
+    far = paths.moved(VIEW, 0.25, depth=4.0)
     assert far.centre.tolist() == pytest.approx([0.0, -16.0, 0.0], abs=1e-9)
     assert (far.fx, far.trained_focal) == (VIEW.fx, None)
 
@@ -45,7 +45,7 @@ def test_up_is_what_is_up_in_the_images():
 
 
 def test_frames_are_named_by_number():
-    frames = paths.frames(lambda t: paths.zoom(VIEW, t, 1.0, 0.5), 11)
+    frames = paths.frames(lambda t: paths.zoomed(VIEW, paths.factor(t, 1.0, 0.5)), 11)
     assert [frame.name for frame in frames][:2] == ["00", "01"]
     assert frames[1].fx == pytest.approx(frames[-1].fx)  # there and back
 

@@ -30,16 +30,6 @@ def moved(view: Camera, by: float, depth: float) -> Camera:
     return replace(view, cam_from_world=pose, trained_focal=None)
 
 
-def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
-    """The view with its focal length multiplied by `factor`."""
-    return zoomed(view, factor(t, start, end))
-
-
-def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
-    """A free camera, moved by `factor`: see `moved`."""
-    return moved(view, factor(t, start, end), depth)
-
-
 def factor(t: float, start: float, end: float) -> float:
     """The factor on the sampling rate that a zoom or dolly has at t."""
     progress = 0.5 - 0.5 * math.cos(2 * math.pi * t)

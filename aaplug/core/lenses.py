@@ -184,7 +184,7 @@ class Lens:
             return places, torch.ones_like(places[..., 0], dtype=torch.bool)
         end, _ = self._end
         radii = torch.linspace(0, end, RADII, dtype=torch.float64, device=places.device)
-        mapped = radii * _series(self.radial, radii**2)[0] / _series(self.rational, radii**2)[0]
+        mapped = self._mapped(radii)
         wanted, distance = places.double(), _length(places.double())
         upper = torch.searchsorted(mapped, distance.contiguous()).clamp(1, RADII - 1)
         below, above = mapped[upper - 1], mapped[upper]
@@ -198,13 +198,16 @@ class Lens:
         inside = (error <= PLACE_TOLERANCE) & (_length(plane) <= end)
         return plane.to(places), inside
 
+    def _mapped(self, radii: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
+        """The radial map."""
+        return radii * _series(self.radial, radii**2)[0] / _series(self.rational, radii**2)[0]
+
     @cached_property
     def _end(self) -> tuple[float, float]:
         """Undistorted radius at which the lens ends, and the slope at which its radial map goes on."""
         most = MAX_RADII[self.projection]
         radii = torch.linspace(0, most, RADII, dtype=torch.float64)
-        mapped = radii * _series(self.radial, radii**2)[0] / _series(self.rational, radii**2)[0]
-        slopes = torch.diff(mapped) / (most / (RADII - 1))
+        slopes = torch.diff(self._mapped(radii)) / (most / (RADII - 1))
         flat = (~(slopes >= MIN_SLOPE)).nonzero()
         last = int(flat[0]) if len(flat) else RADII - 1
         if not last:

@@ -57,7 +57,6 @@ class Photograph:
 class Downscale:
     """A downscaling method; `protocol` describes it for reports."""
 
-    name: str
     protocol: str
     read: Callable[[Path, Background, Undistortion | None], Photograph]
 
@@ -122,9 +121,8 @@ def _pil_bicubic(path: Path, background: Background, undistortion: Undistortion 
 BOX = "box average (area-weighted where the factor is not whole), after compositing and 8-bit rounding"
 RGBA_BOX = "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut again (multi-scale Blender data)"
 PIL_BICUBIC = "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)"
-METHODS = [
-    Downscale("box", BOX, _box),
-    Downscale("rgba-box", RGBA_BOX, _rgba_box),
-    Downscale("pil-bicubic", PIL_BICUBIC, _pil_bicubic),
-]
-DOWNSCALES = {method.name: method for method in METHODS}
+DOWNSCALES = {
+    "box": Downscale(BOX, _box),
+    "rgba-box": Downscale(RGBA_BOX, _rgba_box),
+    "pil-bicubic": Downscale(PIL_BICUBIC, _pil_bicubic),
+}

@@ -50,13 +50,14 @@ class Subject:
     words: Sequence[str]
     views: Sequence[Camera] = field(init=False)
     _prepared: Callable[[Side], Renderer] = field(init=False, repr=False)
-    _prominent: dict[int, tuple[Gaussians, Gaussians]] = field(default_factory=dict, init=False, repr=False)
+    _prominent: Callable[[Gaussians], Gaussians] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         test = {id(camera) for camera in self.cameras.test}
         test_first = sorted(self.cameras.all, key=lambda camera: id(camera) not in test)
         self.views = spread(test_first, MAX_VIEWS)
         self._prepared = lru_cache(MAX_RENDERERS)(self._prepare)
+        self._prominent = lru_cache(MAX_RENDERERS)(lambda scene: replace(scene, origin=None)[self._by_prominence])
 
     @property
     def opening(self) -> tuple[Side, Side]:
@@ -91,14 +92,8 @@ class Subject:
         renderer = self.renderer(side, background)
         if renderer.cutter is not None:
             return self.renderer(replace(side, quality=next(iter(QUALITIES))), background)
-        scene = renderer.scene
-        if id(scene) not in self._prominent:
-            while len(self._prominent) >= MAX_RENDERERS:
-                self._prominent.pop(next(iter(self._prominent)))
-            self._prominent[id(scene)] = scene, replace(scene, origin=None)[self._by_prominence]
-        _, prominent = self._prominent[id(scene)]
-        bounds = renderer.training.bounds[self._by_prominence[:count]]
-        return replace(renderer, scene=prominent[:count], training=replace(renderer.training, bounds=bounds))
+        training = replace(renderer.training, bounds=renderer.training.bounds[self._by_prominence[:count]])
+        return replace(renderer, scene=self._prominent(renderer.scene)[:count], training=training)
 
     def about(self) -> dict[str, Any]:
         """The facts that a page needs to begin, as JSON."""

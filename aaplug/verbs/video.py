@@ -165,13 +165,14 @@ def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
     count = max(1, round(options.seconds * fps))
     if count > MAX_FRAMES:
         raise UsageError("seconds", f"makes {count:,} frames; the limit is {MAX_FRAMES:,}")
-    view, name, ends = job.views[0], str(options.path), {"start": options.start, "end": options.end}
+    view, name = job.views[0], str(options.path)
+    rate = partial(camera_paths.factor, start=options.start, end=options.end)
     job.monitor.say(f"path: {name} from view {view.name}")
     if name == "zoom":
-        return camera_paths.frames(partial(camera_paths.zoom, view, **ends), count)
+        return camera_paths.frames(lambda t: camera_paths.zoomed(view, rate(t)), count)
     depth = median_depth(job.scene.gaussians().means, view)
     if name == "dolly":
-        return camera_paths.frames(partial(camera_paths.dolly, view, **ends, depth=depth), count)
+        return camera_paths.frames(lambda t: camera_paths.moved(view, rate(t), depth), count)
     up = camera_paths.up_of(job.cameras)
     return camera_paths.frames(partial(camera_paths.orbit, view, depth=depth, up=up), count)
 
