@@ -14,7 +14,7 @@ from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, op
 from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.training import TrainingViews
-from aaplug.io.lenses import Distortion, cameras_of_photographs, undistorted
+from aaplug.io.lenses import Distortion, undistorted, with_lenses
 from aaplug.io.photographs import read_photo
 from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rendering.renderer import Renderer
@@ -83,7 +83,7 @@ def camera_of(tmp_path, lens: tuple[str, tuple[float, ...]], times: int = 1) -> 
     fx, fy, cx, cy = PINHOLE
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera("a", *SIZE, fx, fy, cx, cy, pose, photo=tmp_path / "a.png")
-    return cameras_of_photographs([camera], [distortion(lens)], undistort=True)[0]
+    return with_lenses([camera], [distortion(lens)], undistort=True)[0][0]
 
 
 def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_a_barrel_shows_all_of_its_pinhole_and_a_pincushion_most(tmp_path):
 def test_a_lens_that_shows_little_of_its_pinhole_has_no_photograph(tmp_path):
     camera = replace(camera_of(tmp_path, MODELS["barrel"]), undistortion=None)
     strong = distortion(("OPENCV", (30.0, 0.0, 0.0, 0.0)))
-    (bare,) = cameras_of_photographs([camera], [strong], undistort=True)
+    (bare,), _ = with_lenses([camera], [strong], undistort=True)
     assert (bare.photo, bare.undistortion, bare.width) == (None, None, SIZE[0])
     image = torch.rand(4, 5, 3)
     assert undistorted(image, None) is image

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet, numbered
+from aaplug.core.cameras import Camera, CameraSet, numbered, rigid_motion
 
 NEIGHBOURS = 6  # cameras nearest to each, between which and itself its free views lie
 LEAST_SHARE, LARGEST_SHARE = 0.2, 0.8  # of the way to the neighbour
@@ -44,10 +44,9 @@ def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Came
     from scipy.spatial.transform import Rotation  # takes a third of a second to import
 
     pivot = view.centre + depth * view.cam_from_world[2, :3]
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = torch.from_numpy(Rotation.from_rotvec(2 * math.pi * t * up.double().numpy()).as_matrix())
-    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
-    return replace(view, cam_from_world=view.cam_from_world @ turn, trained_focal=None)
+    turn = torch.from_numpy(Rotation.from_rotvec(2 * math.pi * t * up.double().numpy()).as_matrix())
+    pose = view.cam_from_world @ rigid_motion(turn, pivot - turn @ pivot)
+    return replace(view, cam_from_world=pose, trained_focal=None)
 
 
 def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
@@ -85,8 +84,7 @@ def between(first: Camera, last: Camera, share: float) -> Camera:
     turn = last.cam_from_world[:3, :3] @ first.cam_from_world[:3, :3].T  # from the first camera's frame to the last's
     part = Rotation.from_rotvec(share * Rotation.from_matrix(turn.numpy()).as_rotvec())
     rotation = torch.from_numpy(part.as_matrix()) @ first.cam_from_world[:3, :3]
-    pose = torch.eye(4, dtype=first.cam_from_world.dtype)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ first.centre.lerp(last.centre, share)
+    pose = rigid_motion(rotation, -rotation @ first.centre.lerp(last.centre, share))
     return replace(first, cam_from_world=pose, trained_focal=None, photo=None)
 
 

@@ -321,11 +321,15 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
     if not float(right.norm()) > MIN_SINE:
         raise UsageError("up", f"expected a direction other than that of sight, got {up.tolist()}")
     right = torch.nn.functional.normalize(right, dim=0)
-    down = torch.linalg.cross(forward, right)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, down, forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return rigid_motion(rotation, -rotation @ eye)
+
+
+def rigid_motion(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
+    """The motion that turns and then moves."""
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = rotation, translation
+    return motion
 
 
 def digest_of_cameras(views: Sequence[Camera]) -> str:

@@ -39,10 +39,10 @@ def panorama(width: int, height: int) -> tuple[float, float, float, float]:
     return width / (2 * math.pi), height / math.pi, width / 2, height / 2
 
 
-def cameras_of_photographs(
+def with_lenses(
     cameras: Sequence[Camera], distortions: Sequence[Distortion | None], undistort: bool
-) -> list[Camera]:
-    """The cameras with their lenses; without photographs that cannot be used.
+) -> tuple[list[Camera], list[str]]:
+    """The cameras with their lenses, without photographs that cannot be used; and notes on the lenses, if any.
 
     undistort: as pinholes instead, cropped to what their photographs cover.
 
@@ -59,7 +59,7 @@ def cameras_of_photographs(
         elif distortion is not None:
             camera = _straightened(camera, distortion.lens)
         drawn.append(camera)
-    return drawn
+    return drawn, _notes(distortions, drawn, undistort)
 
 
 def _straightened(camera: Camera, lens: Lens | None) -> Camera:
@@ -86,8 +86,8 @@ def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None
     return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], undistort: bool) -> list[str]:
-    """Notes on the panoramas and the lenses that distort, with the names of their models, if there are any."""
+def _notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], undistort: bool) -> list[str]:
+    """Notes on the panoramas and the lenses that distort, with the names of their models."""
     pairs = [
         (lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens and lens.name != PANORAMA
     ]

@@ -7,34 +7,23 @@ lengths and principal points are in px.  A camera keeps its lens, as far as `cor
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.lenses import EQUIRECT, Lens, opencv_lens
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import pose
 from aaplug.io.cameras.sets import CameraFileOptions
-from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
+from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
 from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
 MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
-FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-LENSES: dict[str, Callable[..., Lens]] = {  # by the model's distortion parameters, in COLMAP's order
-    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"), lambda *k: opencv_lens(k)),
-    **dict.fromkeys(FISHEYES, lambda *k: opencv_lens(k, fisheye=True)),
-    PANORAMA: lambda: EQUIRECT,
-    "THIN_PRISM_FISHEYE": lambda k1, k2, p1, p2, k3, k4, sx1, sy1: Lens(
-        "equidistant", (k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0)
-    ),
-}
 
 name = "colmap"
 sign = "sparse/0 or sparse (COLMAP)"
@@ -63,11 +52,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     trained, why = sets.at_photo_size(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
-    trained = cameras_of_photographs(trained, lenses, options.undistort)
+    trained, lens_notes = with_lenses(trained, lenses, options.undistort)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
-    more += lens_notes(lenses, trained, options.undistort)
-    return sets.camera_set(kind, source, split, why, more=more)
+    return sets.camera_set(kind, source, split, why, more=more + lens_notes)
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -120,5 +108,5 @@ def _distortion(lens: Intrinsics) -> Distortion | None:
     rest = lens.parameters[lens.model.focals + 2 :]
     if lens.model.straight and not any(rest):
         return None
-    values, lens_of = [number(value, lens.place, "parameter") for value in rest], LENSES.get(lens.model.name)
-    return Distortion(lens.model.name, lens_of(*values) if lens_of else None)
+    values, lens_of = tuple(number(value, lens.place, "parameter") for value in rest), lens.model.lens
+    return Distortion(lens.model.name, lens_of(values) if lens_of else None)

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
+from aaplug.core.lenses import EQUIRECT, Lens, opencv_lens
+from aaplug.io.lenses import PANORAMA
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, text
 from aaplug.system.errors import FormatError, reason
@@ -42,33 +44,44 @@ class Model:
     parameters: how many.
     focals: how many of them are focal lengths, which come first; cx and cy follow, then distortion.
     straight: true if it is a pinhole when all distortion is zero.
+    lens: called with the distortion's parameters; None for a model that `Lens` lacks.
     """
 
     name: str
     parameters: int
     focals: int
     straight: bool
+    lens: Callable[[tuple[float, ...]], Lens] | None = None
+
+
+def _fisheye(coefficients: tuple[float, ...]) -> Lens:
+    return opencv_lens(coefficients, fisheye=True)
+
+
+def _thin_prism_fisheye(coefficients: tuple[float, ...]) -> Lens:
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
+    return Lens("equidistant", (k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0))
 
 
 MODELS = (  # by COLMAP's model id
     Model("SIMPLE_PINHOLE", 3, 1, True),
     Model("PINHOLE", 4, 2, True),
-    Model("SIMPLE_RADIAL", 4, 1, True),
-    Model("RADIAL", 5, 1, True),
-    Model("OPENCV", 8, 2, True),
-    Model("OPENCV_FISHEYE", 8, 2, False),
-    Model("FULL_OPENCV", 12, 2, True),
+    Model("SIMPLE_RADIAL", 4, 1, True, opencv_lens),
+    Model("RADIAL", 5, 1, True, opencv_lens),
+    Model("OPENCV", 8, 2, True, opencv_lens),
+    Model("OPENCV_FISHEYE", 8, 2, False, _fisheye),
+    Model("FULL_OPENCV", 12, 2, True, opencv_lens),
     Model("FOV", 5, 2, True),
-    Model("SIMPLE_RADIAL_FISHEYE", 4, 1, False),
-    Model("RADIAL_FISHEYE", 5, 1, False),
-    Model("THIN_PRISM_FISHEYE", 12, 2, False),
+    Model("SIMPLE_RADIAL_FISHEYE", 4, 1, False, _fisheye),
+    Model("RADIAL_FISHEYE", 5, 1, False, _fisheye),
+    Model("THIN_PRISM_FISHEYE", 12, 2, False, _thin_prism_fisheye),
     Model("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, False),
     Model("SIMPLE_DIVISION", 4, 1, True),
     Model("DIVISION", 5, 2, True),
-    Model("SIMPLE_FISHEYE", 3, 1, False),
-    Model("FISHEYE", 4, 2, False),
+    Model("SIMPLE_FISHEYE", 3, 1, False, _fisheye),
+    Model("FISHEYE", 4, 2, False, _fisheye),
     Model("EUCM", 6, 2, False),
-    Model("EQUIRECTANGULAR", 2, 0, False),
+    Model(PANORAMA, 2, 0, False, lambda _: EQUIRECT),
 )
 MODEL_NAMES = {model.name: model for model in MODELS}
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import MAX_ROTATION_ERROR
+from aaplug.core.cameras import MAX_ROTATION_ERROR, rigid_motion
 from aaplug.io.values import Entry, Place
 
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
@@ -30,18 +30,13 @@ def pose(
     if torch.linalg.det(rotation) <= 0:
         raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")
     left, _, right = torch.linalg.svd(rotation)
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3] = left @ right
-    motion[:3, 3] = translation
-    return motion
+    return rigid_motion(left @ right, translation)
 
 
 def inverse(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """The inverse of a rigid motion."""
-    back = torch.eye(4, dtype=torch.float64)
-    back[:3, :3] = motion[:3, :3].T
-    back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
-    return back
+    back = motion[:3, :3].T
+    return rigid_motion(back, -back @ motion[:3, 3])
 
 
 def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:

@@ -28,7 +28,7 @@ from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, r
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import PNG_SIGNATURE, image_size
-from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
+from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json, read_start, text
 from aaplug.system.errors import FormatError
 
@@ -112,9 +112,7 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     spare = image_size(photo) if photo else None  # for frames without w, h and photo
     parser = None if exported else _dataparser(file.parent / DATAPARSER)
     cameras = [_camera(*each, spare, parser) for each in zip(frames, photos, names, strict=True)]
-    lenses = [_distortion(frame) for frame in frames]
-    cameras = cameras_of_photographs(cameras, lenses, options.undistort)
-    notes = lens_notes(lenses, cameras, options.undistort)
+    cameras, notes = with_lenses(cameras, [_distortion(frame) for frame in frames], options.undistort)
     if exported:
         notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
     elif parser:
