@@ -91,8 +91,7 @@ def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 
     shift = other.cam_from_world[:3, 3] - turn @ camera.cam_from_world[:3, 3]
     seen = (rays * splats.depths[:, None]) @ turn.T.to(rays) + shift.to(rays)
     if splats.planes is None:
-        zoom, offset = (seen.new_tensor(pair) for pair in ((other.fx, other.fy), (other.cx, other.cy)))
-        return (seen[:, :2] / seen[:, 2:].clamp(min=NEAR) * zoom + offset).clamp(-MAX_SHIFT, MAX_SHIFT)
+        return other.pixels(seen[:, :2] / seen[:, 2:].clamp(min=NEAR)).clamp(-MAX_SHIFT, MAX_SHIFT)
     zoom = seen.new_tensor([other.fx / camera.fx, other.fy / camera.fy])
     right, down, ahead = torch.einsum("mij,mj->im", splats.planes, seen)
     return (torch.stack([right, down], dim=1) / ahead.clamp(min=NEAR)[:, None] * zoom).clamp(-MAX_SHIFT, MAX_SHIFT)

@@ -52,6 +52,9 @@ class CfgArgs:
         return target, max(1, height * target // width)  # 3DGS truncates here, and rounds above
 
 
+UNKNOWN = CfgArgs()  # of a run without the file
+
+
 def read_cfg_args(path: Path) -> CfgArgs:
     """Read the settings that concern cameras; those that the file does not mention have their defaults."""
     source, settings = read_bounded(path, whole_limit("CFG_ARGS")), {}

@@ -15,7 +15,7 @@ from pathlib import Path
 from aaplug.core.cameras import Camera, CameraSet, centred, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import cfg_args, sets
-from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
+from aaplug.io.cameras.cfg_args import UNKNOWN, WIDTH_CAP, CfgArgs, read_cfg_args
 from aaplug.io.cameras.photos import photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions
@@ -40,8 +40,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     file = folder / FILE if path == folder or path.name == cfg_args.NAME else path
     items = entries(file, "camera", read_json(file))
     run = folder / cfg_args.NAME
-    settings = read_cfg_args(run) if os.path.isfile(run) else None
-    photos = photo_folder(folder, options, (settings or CfgArgs()).images, Place(run, "images"))
+    settings = read_cfg_args(run) if os.path.isfile(run) else UNKNOWN
+    photos = photo_folder(folder, options, settings.images, Place(run, "images"))
     source = with_photos([_camera(item) for item in items], [item.place for item in items], photos)
     views = dict[tuple[object, ...], Camera]()
     for camera in source:  # some runs list a view once per split
@@ -52,12 +52,9 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         source = [replace(camera, name=name) for camera, name in zip(source, short, strict=True)]
     trained, why = _trained(source, settings, options)
     split = _split(trained, settings, options)
-    background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
-    more = []
-    if settings and settings.source and not photographs(source):
-        more = [
-            f"photos: none found; training had them in {settings.source}/{settings.images}; `images` names a folder"
-        ]
+    background = {None: None, True: WHITE, False: BLACK}[settings.white_background]
+    missing = f"photos: none found; training had them in {settings.source}/{settings.images}; `images` names a folder"
+    more = [missing] if settings.source and not photographs(source) else []
     return sets.camera_set("INRIA cameras.json", source, split, why, background, more)
 
 
@@ -86,39 +83,34 @@ def _camera(entry: Entry) -> Camera:
     return replace(centred(entry.get("img_name", text), size, fx, cam_from_world), fy=fy)
 
 
-def _trained(
-    cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions
-) -> tuple[list[Camera], str]:
+def _trained(cameras: Sequence[Camera], run: CfgArgs, options: CameraFileOptions) -> tuple[list[Camera], str]:
     """The cameras at 3DGS's sizes, by its rule, of the photos that training loaded; and why, for a note."""
     if options.train_scale is not None:
         return sets.at_file_size(cameras, options)
-    run = settings or CfgArgs()
     n = run.divisor
-    if any(camera.photo for camera in cameras):
+    if photographs(cameras):
         loaded, why = sets.photo_sizes(cameras), "size of the photos"
     else:  # tools that make images_N folders round halves up; Python rounds them to even
         loaded = [tuple(max(1, math.floor(side / n + 0.5)) for side in (c.width, c.height)) for c in cameras]
         why = "size in the file" + (f" / {n} for {run.images}" if n > 1 else "")
     rule = f"resolution {run.resolution:g} in cfg_args"
-    if settings is None:
+    if run is UNKNOWN:
         rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: `train_scale` sets it"
     return sets.trained_at(cameras, [run.size(*size) for size in loaded]), f"{why}, {rule}"
 
 
-def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> CameraSet:
+def _split(cameras: Sequence[Camera], run: CfgArgs, options: CameraFileOptions) -> CameraSet:
     """The split by name, or by order where the names begin again: Blender's test views r_0, ..., then training's."""
-    held_out = settings is not None and settings.held_out
     counts, occurrences = Counter[str](), list[int]()
     for camera in cameras:
         counts[camera.name] += 1
         occurrences.append(counts[camera.name])
     second = next((index for index, times in enumerate(occurrences) if times > 1), len(cameras))
     again = [camera.name for camera in cameras[second:]]
-    if held_out and options.test_every is None and again and len(set(again)) == len(again):
+    if run.held_out and options.test_every is None and again and len(set(again)) == len(again):
         return sets.explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
     pairs = zip(cameras, occurrences, strict=True)
     renamed = [camera if times == 1 else replace(camera, name=f"{camera.name}~{times}") for camera, times in pairs]
     ordered = sorted(renamed, key=lambda camera: camera.name)
-    if settings is None:
-        return sets.every_nth(ordered, options, 0, "no cfg_args; `test_every` 8 is 3DGS's rule")
-    return sets.every_nth(ordered, options, sets.LLFF_HOLD if held_out else 0, f"eval={held_out} in cfg_args")
+    reason = "no cfg_args; `test_every` 8 is 3DGS's rule" if run is UNKNOWN else f"eval={run.held_out} in cfg_args"
+    return sets.every_nth(ordered, options, sets.LLFF_HOLD if run.held_out else 0, reason)
