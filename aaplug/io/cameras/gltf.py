@@ -26,8 +26,6 @@ PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}  # that mov
 MIN_RATE, MAX_RATE = 10.0, 240.0  # frames per second; sparser keys are no frames
 EVEN = 1e-3  # of the spacing between keys, which counts as rounding
 
-name = "gltf"
-
 
 def sniff(path: Path) -> bool:
     """True for a file of that name."""

@@ -26,8 +26,6 @@ EASINGS = (
     lambda t: torch.where(t < 0.5, 4 * t**3, 1 - 4 * (1 - t) ** 3),
 )
 
-name = "lichtfeld"
-
 
 def sniff(path: Path) -> bool:
     """True for a file with the keys of a timeline."""

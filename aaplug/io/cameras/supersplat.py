@@ -27,8 +27,6 @@ UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 MAX_ANGLE = 180.0  # degrees
 FOV = 60.0  # degrees, if nothing says
 
-name = "supersplat"
-
 
 def sniff(path: Path) -> bool:
     """True for a file with animations."""

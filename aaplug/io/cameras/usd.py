@@ -25,8 +25,6 @@ from aaplug.system.extras import install_command
 UNIT = 10.0  # of the camera's lengths in a world unit
 MAX_LAYERS = 1000
 
-name = "usd"
-
 
 def sniff(path: Path) -> bool:
     """True for a file of that name."""
