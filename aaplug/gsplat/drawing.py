@@ -3,7 +3,7 @@
 m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -19,11 +19,10 @@ from aaplug.core.lenses import PINHOLE
 from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.shading import shade
-from aaplug.core.splats import Splats2D
+from aaplug.core.splats import Render, Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
-from aaplug.rendering import passes
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
@@ -79,20 +78,9 @@ def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels
     return torch.cat(parts, dim=1)
 
 
-def composited(
-    splats: Splats2D,
-    features: Float[Tensor, "m d"],
-    options: Options,
-    rasterizer: Rasterizer,
-    pixel: PixelKernel,
-    per_call: Sequence[int],
-) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]:
-    """Premultiplied channels, and alpha.  per_call: the numbers of channels of which one is drawn at a time."""
-    rules = options.convention.rules
-    image = passes.composited(
-        splats, features, lambda part: rasterizer(part, options.hw, BLACK, pixel, None, rules), per_call
-    )
-    return image.rgb, image.alpha[..., None]
+def drawer(rasterizer: Rasterizer, options: Options, pixel: PixelKernel) -> Callable[[Splats2D], Render]:
+    """What composites splats over black, by a pixel kernel."""
+    return lambda splats: rasterizer(splats, options.hw, BLACK, pixel, None, options.convention.rules)
 
 
 def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view: View, options: Options) -> Tensor:

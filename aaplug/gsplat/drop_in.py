@@ -14,11 +14,12 @@ from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.drawing import composited, features_of, finished, splats_of
+from aaplug.gsplat.drawing import drawer, features_of, finished, splats_of
 from aaplug.gsplat.table import Layout, conics
 from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers.choice import kernels_of
+from aaplug.rendering.passes import composited
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
 
@@ -156,8 +157,9 @@ def rasterization(
             pixel = POINT if add is None else AbsolutePoint(absolute_gradients_to=add)
             tracked = torch.is_grad_enabled() and (part.means.requires_grad or features.requires_grad)
             per_call = CHANNELS_PER_CALL_WITH_GRADIENTS if tracked else CHANNELS_PER_CALL
-            image, alpha = composited(part, features, options, painter, pixel, per_call)
-            images.append((finished(image, alpha, view, options), alpha))
+            image = composited(part, features, drawer(painter, options, pixel), per_call)
+            alpha = image.alpha[..., None]
+            images.append((finished(image.rgb, alpha, view, options), alpha))
     colours, alphas = (
         torch.stack([image.contiguous() for image in column]).unflatten(0, layout.shape)
         for column in zip(*images, strict=True)

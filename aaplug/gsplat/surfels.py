@@ -16,11 +16,12 @@ from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.discs import Discs, distortion, median_depth, normals_of_depth, splats_of
-from aaplug.gsplat.drawing import composited, features_of, finished
+from aaplug.gsplat.drawing import drawer, features_of, finished
 from aaplug.gsplat.drop_in import Above0, From0, Kernel, MaxAlpha
 from aaplug.gsplat.table import Layout
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.rasterizers.choice import kernels_of
+from aaplug.rendering.passes import composited
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of
@@ -114,8 +115,9 @@ def rasterization_2dgs(
             part = replace(part, means=means)
             features = features_of(part, view, options, kernels)
             channels = torch.cat([features, discs.normals], dim=1)
-            image, alpha = composited(part, channels, options, painter, SURFEL, (3,))
-            image, normals = image.split([features.shape[1], 3], dim=2)
+            image = composited(part, channels, drawer(painter, options, SURFEL), (3,))
+            alpha = image.alpha[..., None]
+            image, normals = image.rgb.split([features.shape[1], 3], dim=2)
             image = finished(image, alpha, view, options)
             median = median_depth(part, options, painter)
             if options.coloured and options.render_mode != "RGB":
