@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
@@ -111,6 +111,12 @@ class Options:
     def coloured(self) -> bool:
         """True where colours are drawn."""
         return self.render_mode.startswith("RGB")
+
+    def shows(self, middles: Float[Tensor, "m 2"], radii: Float[Tensor, "m 2"]) -> Bool[Tensor, " m"]:
+        """Which boxes, of half these sides, reach into the image and are larger than `radius_clip` along an axis."""
+        low, high = middles - radii, middles + radii
+        inside = (high > 0).all(dim=1) & (low < low.new_tensor([self.width, self.height])).all(dim=1)
+        return inside & (radii > self.radius_clip).any(dim=1)
 
     @property
     def convention(self) -> Convention:

@@ -65,12 +65,9 @@ class Discs:
         with torch.no_grad():
             middles, extents, ahead = _boxes(transforms.double())
             radii = (REACH * extents).ceil()
-            low, high = middles - radii, middles + radii
             depths = centres[:, 2]
             keep = (depths > options.near_plane) & (depths < options.far_plane) & ahead
-            keep = keep & (radii > options.radius_clip).any(dim=1) & (high > 0).all(dim=1)
-            keep = keep & (low < low.new_tensor([options.width, options.height])).all(dim=1)
-            sources = keep.nonzero().squeeze(1)
+            sources = (keep & options.shows(middles, radii)).nonzero().squeeze(1)
         columns = (x.index_select(0, sources) for x in (transforms, normals, view.opacities, radii.int()))
         return cls(sources, *columns)
 

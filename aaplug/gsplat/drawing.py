@@ -55,10 +55,8 @@ def splats_of(view: View, options: Options, kernels: Kernels) -> tuple[Splats2D,
     with torch.no_grad():
         reach = squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=0.0).sqrt()
         radii = (reach[:, None] * splats.covs[:, ::2].sqrt()).ceil().clamp(max=MAX_RADIUS)
-    low, high = splats.means - radii, splats.means + radii
     keep = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
-    keep = keep & (radii > options.radius_clip).any(dim=1)
-    keep = keep & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
+    keep = keep & options.shows(splats.means, radii)
     splats = splats[keep]
     if not options.global_z_order:
         offsets = view.scene.means.index_select(0, splats.sources).double() - camera.centre
