@@ -296,6 +296,7 @@ MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
     ("metric wrong", "stops"): (lambda image, truth: next(iter(())), "StopIteration"),
     ("loss wrong", "shape"): (lambda image, truth: image, "should return a tensor [] of float32 or float64"),
     ("loss wrong", "no gradient"): (lambda image, truth: image.detach().mean(), "gradient"),
+    ("loss wrong", "nan"): (lambda image, truth: image.mean() * math.nan, "step 1: expected a finite number, got nan"),
     ("scene format wrong", "returns nothing"): (lambda *_: None, "should return a Scene, got None"),
     ("writing scene format wrong", "writes nothing"): (lambda *_: None, "has not written"),
     ("camera format wrong", "returns a list"): (lambda *_: [make_camera()], "CameraSet, got a list of a Camera"),

@@ -49,7 +49,7 @@ def run(
     keep: called with the state and the snapshot to fall back to, also when the run stops.
     stop: asked before every step.  say: called when the run rolls back.
 
-    Raises UsageError if no step has a finite gradient, at any learning rate.
+    Raises UsageError if no step has a finite gradient, at any learning rate, or the loss breaks its interface.
     """
     fallback = fallback or snapshot(state)
     while state.step < job.settings.steps and not stop():
@@ -117,6 +117,9 @@ def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[F
     loss = asked("loss", LOSSES[name], "__call__", image, truth.to(image))
     if image.requires_grad and not loss.requires_grad:
         raise PlugInError(f"loss {name}", "should have a gradient in the image, got none")
+    if not loss.isfinite() and image.isfinite().all():
+        problem = f"at step {state.step + 1}: expected a finite number, got {loss.item()}"
+        raise PlugInError(f"loss {name}", problem)
     return loss, drawing
 
 
