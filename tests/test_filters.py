@@ -9,9 +9,8 @@ import torch
 from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.lab.adaptive import ADAPTIVE_VARIANCE, Adaptive
+from aaplug.lab.filters import ADAPTIVE_VARIANCE, LEAST_SHARE, Adaptive, AnisotropicSmoothing
 from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
-from aaplug.lab.smoothing import LEAST_SHARE, AnisotropicSmoothing
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D

@@ -21,11 +21,10 @@ from aaplug.finetuning.parameters import RATES, between, extent, least_log_scale
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
-from aaplug.lab import densification
-from aaplug.lab.densification import MIN_GRADIENT, MIN_OPACITY, SPLIT_SHRINKAGE, densify, moments_after
+from aaplug.lab import mipmap_gs
 from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
 from aaplug.lab.losses import l1_dssim, structural_similarity
-from aaplug.lab.mipmap_gs import MIPMAP_GS
+from aaplug.lab.mipmap_gs import MIN_GRADIENT, MIN_OPACITY, MIPMAP_GS, SPLIT_SHRINKAGE, densify, moments_after
 from aaplug.methods import RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
@@ -205,7 +204,7 @@ def test_the_optimizer_forgets_what_is_new_alone():
 
 def test_a_densified_scene_is_reported_with_its_own_bounds(monkeypatch):
     """The scene before has fewer Gaussians, and `matched` reads a bound of each."""
-    monkeypatch.setattr(densification, "STEPS", 2)
+    monkeypatch.setattr(mipmap_gs, "STEPS", 2)
     state = after(job := replace(make_job(settings=replace(SETTINGS, steps=4)), method=MIPMAP_GS))
     here = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
     assert len(state.bounds.highest) == len(state.leaves["means"]) > 60
@@ -254,7 +253,7 @@ def test_groups_are_drawn_by_opacity():
 
 @pytest.mark.parametrize(("method", "stopped_at"), [(CONSISTENCY, 2), (MIPMAP_GS, 3), (GROUP_TRAINING, 3)])
 def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stopped_at, tmp_path, monkeypatch):
-    monkeypatch.setattr(densification, "STEPS", 2)
+    monkeypatch.setattr(mipmap_gs, "STEPS", 2)
     job = replace(make_job(), method=method)
     whole = begin(job)
     assert run(job, whole, every=2)

@@ -10,7 +10,7 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.sampling import check_frame, median_rates, sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.lab.smoothing import view_information
+from aaplug.lab.filters import view_information
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import make_camera, make_scene, memory_taken, needs_peak_memory, straight_camera

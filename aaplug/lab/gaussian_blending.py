@@ -38,6 +38,7 @@ from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.lab.integral import principal_columns
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, PIXELS, next_rows, rows_of
+from aaplug.rasterizers.tiled.forward import EXAMPLE_TILES, MIN_TILES
 
 MIN_WINDOW_VARIANCE = 1e-3  # px²: of a window along one side
 MAX_POINT_SPAN = 0.1  # standard deviations: a window that spans less is taken as a point
@@ -46,8 +47,6 @@ MAX_DISTANCE = 4.0  # standard deviations from a window's edge, beyond which the
 SPLATS_PER_PASS = 4  # more compile slowly
 GATHERED = 2 * SPLATS_PER_PASS  # raster rows that a tile gathers at once
 COMPACT_BELOW = 7 / 8  # tiles that are done are dropped once the share of the others is below this
-MIN_TILES = 2  # tiles in a pass: compiled kernels take no fewer
-EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
 
 
 class Light(NamedTuple):

@@ -12,7 +12,7 @@ from aaplug.core.conventions import CLASSIC, CONVENTIONS, MIP
 from aaplug.core.projection import project
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.laws.filters import CAMERAS, F64, SCENE, SITUATIONS, spheres, trained_with, world_scene
-from aaplug.lab.smoothing import AnisotropicSmoothing, FlatSmoothing
+from aaplug.lab.filters import AnisotropicSmoothing, FlatSmoothing
 from aaplug.methods import SCREEN_FILTERS, WORLD_FILTERS
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
