@@ -11,10 +11,11 @@ so there are views in which a Gaussian and what replaces it are both drawn, or n
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, spread
@@ -34,21 +35,23 @@ VIEWS = 50  # training views that sizes are taken from
 HALF_LEVEL = 2**0.5  # half a level, as a ratio of sampling rates
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Gaussians, the level that each was merged for, and the level that replaces it: 0 for none."""
+class _Part(NamedTuple):
+    """Gaussians, and the level that each was merged for: 0 for none."""
 
     scene: Gaussians
     level: Int[Tensor, " n"]
-    replaced: Int[Tensor, " n"]
 
     @classmethod
-    def of(cls, scene: Gaussians, level: int | Int[Tensor, " n"] = 0, replaced: int = 0) -> "_Part":
-        every = torch.zeros(len(scene), dtype=torch.int64)
-        return cls(replace(scene, origin=None, extras={}), every + level, every + replaced)
+    def of(cls, scene: Gaussians, level: int = 0) -> "_Part":
+        return cls(replace(scene, origin=None, extras={}), torch.full((len(scene),), level))
 
-    def __getitem__(self, index: Tensor) -> "_Part":
-        return _Part(self.scene[index], self.level[index], self.replaced[index])
+    @classmethod
+    def joined(cls, parts: Sequence["_Part"]) -> "_Part":
+        return cls(joined([part.scene for part in parts]), torch.cat([part.level for part in parts]))
+
+    def where(self, mask: Bool[Tensor, " n"]) -> "_Part":
+        rows = mask.nonzero()[:, 0]
+        return _Part(self.scene[rows], self.level[rows])
 
 
 def in_one_scene(
@@ -68,13 +71,11 @@ def in_one_scene(
         tell(level - 1, levels)
         largest = pixel_sizes(remaining.scene, cameras)[1]
         small, rates = (largest > 0) & (largest / 2**level < MAX_SMALL_SIZE), rates_of(remaining.scene, cameras)
-        remaining, gone = _merged(
-            remaining[(~small).nonzero()[:, 0]], remaining[small.nonzero()[:, 0]], rates[small], level
-        )
+        remaining, gone = _merged(remaining.where(~small), remaining.where(small), rates[small], level)
         done.append(gone)
     parts = [remaining, *done]
-    whole = joined([part.scene for part in parts])
-    levels_of, replaced = (torch.cat([getattr(part, name) for part in parts]) for name in ("level", "replaced"))
+    whole, levels_of = _Part.joined(parts)
+    replaced = torch.cat([torch.full((len(part.scene),), level) for level, part in enumerate(parts)])  # by which level
     least, most = pixel_sizes(whole, cameras)
     middle = (least * most).sqrt()
     smallest = torch.where(replaced > 0, middle * _highest_rate(replaced) / LEAST_SHARE, 0.0)
@@ -112,8 +113,5 @@ def _merged(large: _Part, small: _Part, rates: Float[Tensor, " s"], level: int) 
         replace(clusters, rates=clusters.rates * _highest_rate(torch.tensor(level))), small.scene, covered.weights
     )
     replaced = counts[clusters.labels] > 1
-    gone, stays = (small[rows.nonzero()[:, 0]] for rows in (replaced, ~replaced))
-    fresh = _Part.of(merged[(counts > 1).nonzero()[:, 0]], level=level)
-    parts = (large, stays, fresh)
-    levels = torch.cat([part.level for part in parts])
-    return _Part.of(joined([part.scene for part in parts]), levels), _Part.of(gone.scene, gone.level, level)
+    fresh = _Part.of(merged[(counts > 1).nonzero()[:, 0]], level)
+    return _Part.joined([large, small.where(~replaced), fresh]), small.where(replaced)
