@@ -93,9 +93,9 @@ def convert(words: Words) -> Answer:
     result = aaplug.convert(*inputs, words.output, **told(words, verbs.ConvertOptions))
     from aaplug.evaluation.results import tables
     from aaplug.io.scenes import written_format
-    from aaplug.methods.conversion import fused_in
+    from aaplug.methods.conversion import described_fusions
 
-    how = "part by part" if result.scene is None else f"fused {fused_in(result.scene)}"
+    how = "part by part" if result.scene is None else f"fused {described_fusions(result.scene.fused)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     format = written_format(words.output)  # None for a folder of frames, which are .ply
     say(result.viewer.advice("ply" if format is None else getattr(format, "read_as", None) or format.name))

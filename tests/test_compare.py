@@ -160,11 +160,11 @@ def test_differences_are_found_in_any_order(lopsided):
         found = differences(lopsided, other)
         assert found.sorted == (other is not moved)
         assert found.paired == 1
-        assert found.positions.median == pytest.approx(1e-4, rel=1e-2)
-        assert found.scales.largest == found.opacities.largest == found.harmonics[0].largest == 0
-        assert found.harmonics[1].rms == pytest.approx(0.01, rel=1e-3)
+        assert found.changes["positions"].median == pytest.approx(1e-4, rel=1e-2)
+        assert all(found.changes[name].largest == 0 for name in ("scales", "opacities", "SH 0"))
+        assert found.changes["SH 1"].rms == pytest.approx(0.01, rel=1e-3)
     plain = replace(lopsided, sh=lopsided.sh[:, :1])
-    lost = differences(lopsided, plain).harmonics[1]
+    lost = differences(lopsided, plain).changes["SH 1"]
     assert lost.largest == pytest.approx(float(lopsided.sh[:, 1:4].abs().max()))
     assert differences(lopsided, lopsided[:-1]) is None
 

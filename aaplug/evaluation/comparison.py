@@ -67,22 +67,13 @@ class Differences:
     """The changes from one scene to another.
 
     paired: share of the Gaussians that have a partner.  sorted: true if the order changed.
-    positions: world units.  scales: of ln σ, axis by axis from the thinnest.  opacities: of values in [0, 1].
-    harmonics: of the coefficients, by degree; those that one scene lacks count as 0.
+    changes: of "positions" in world units, "scales" as ln σ, axis by axis from the thinnest, "opacities" in [0, 1], and
+        the coefficients of each degree ("SH 0"), of which those that one scene lacks count as 0.
     """
 
     paired: float
     sorted: bool
-    positions: Change
-    scales: Change
-    opacities: Change
-    harmonics: tuple[Change, ...]
-
-    @property
-    def changes(self) -> dict[str, Change]:
-        """The changes by the quantity's name."""
-        degrees = {f"SH {degree}": change for degree, change in enumerate(self.harmonics)}
-        return {"positions": self.positions, "scales": self.scales, "opacities": self.opacities, **degrees}
+    changes: Mapping[str, Change]
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -104,14 +95,13 @@ def differences(reference: Gaussians, other: Gaussians) -> Differences | None:
     a, b = (scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).sort(dim=1).values for scene in (first, second))
     most = max(first.sh.shape[1], second.sh.shape[1])
     one, two = (torch.nn.functional.pad(s.sh, (0, 0, 0, most - s.sh.shape[1])) for s in (first, second))
-    return Differences(
-        paired=len(first) / len(reference),
-        sorted=not same_rows,
-        positions=Change.of((first.means.double() - second.means.double()).norm(dim=1)),
-        scales=Change.of(a.double() - b.double()),
-        opacities=Change.of(first.opacities.double() - second.opacities.double()),
-        harmonics=tuple(Change.of((one - two)[:, d * d : (d + 1) ** 2]) for d in range(round(most**0.5))),
-    )
+    changes = {
+        "positions": (first.means.double() - second.means.double()).norm(dim=1),
+        "scales": a.double() - b.double(),
+        "opacities": first.opacities.double() - second.opacities.double(),
+        **{f"SH {d}": (one - two)[:, d * d : (d + 1) ** 2] for d in range(round(most**0.5))},
+    }
+    return Differences(len(first) / len(reference), not same_rows, {k: Change.of(v) for k, v in changes.items()})
 
 
 def _nearest(scene: Gaussians, among: Gaussians) -> Int[Tensor, " n"]:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.spectra import energies
@@ -76,7 +76,7 @@ def above_nyquist(renderer: Renderer, views: Sequence[Camera], scale: float) -> 
     if renderer.recipe.pixel is not POINT:
         return None
     total = above = 0.0
-    for view in views[:: -(-len(views) // SPECTRUM_VIEWS)]:
+    for view in spread(views, SPECTRUM_VIEWS):
         splats = renderer.splats(*renderer.sampled(view.scaled(scale)))
         energy, share = (column.double() for column in energies(splats))
         total, above = total + float(energy.sum()), above + float(energy @ share)

@@ -152,19 +152,17 @@ class ViewTruth:
             return self.reference(scale).rgb
         if truth.protocol.change != "size":
             return TimedRenderer(truth.supersampled(scale))(camera).rgb
-        if truth.source == "photographs":
+        photographs = truth.source == "photographs"
+        if photographs:
             factors = self._photograph.factors(self.view, scale)
             if factors[1] <= 1:
                 return self._photograph.at(camera.hw, factors)
         elif truth.renderer.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)
         if truth.enlarge is not None:
-            photographs = truth.source == "photographs"
-            full = (
-                self._photograph.at(self._photograph.hw, (1.0, 1.0)) if photographs else self.look.rgb.clamp(0.0, 1.0)
-            )
+            full = self._photograph.at(self._photograph.hw, (1.0, 1.0)) if photographs else self.look.rgb.clamp(0, 1)
             return truth.enlarge(truth.renderer, full, camera).clamp(0.0, 1.0)
-        if truth.source == "photographs":
+        if photographs:
             return None
         return TimedRenderer(replace(truth.renderer, recipe=find_recipe("auto", quality="best")))(camera).rgb
 

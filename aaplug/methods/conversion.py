@@ -108,9 +108,9 @@ def describe(fusion: Fusion) -> str:
     return f"{fusion.method} ({settings})" if settings else fusion.method
 
 
-def fused_in(scene: Gaussians) -> str:
-    """Everything that is fused in a scene, in words."""
-    return "; ".join(describe(fusion) for fusion in scene.fused) or "nothing"
+def described_fusions(fused: Sequence[Fusion]) -> str:
+    """What is fused in a scene, in words."""
+    return "; ".join(map(describe, fused)) or "nothing"
 
 
 def _check_discs(scene: Gaussians) -> None:
@@ -121,6 +121,5 @@ def _check_discs(scene: Gaussians) -> None:
 
 def _check_unblurred(scene: Gaussians) -> None:
     if blurs := blurring(scene.fused):
-        done = "; ".join(map(describe, blurs))
-        problem = f"already has {done} fused; converting it again would blur it twice"
+        problem = f"already has {described_fusions(blurs)} fused; converting it again would blur it twice"
         raise UsageError(scene.name, f"{problem}; {MERGE_ALONE}")

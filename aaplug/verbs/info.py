@@ -13,7 +13,7 @@ from aaplug.evaluation.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene import Scene
-from aaplug.methods.conversion import describe
+from aaplug.methods.conversion import described_fusions
 from aaplug.options.shared import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of, up_evidence
 from aaplug.rendering.job import CamerasLike, Job
@@ -85,7 +85,7 @@ def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> d
         "two_dimensional": scene.flat,
         "stored_filter_3d": statistics.filtered,
         "fused": [{"method": f.method, **f.settings} for f in scene.fused],
-        "fused_text": "; ".join(describe(f) for f in scene.fused) or "nothing",
+        "fused_text": described_fusions(scene.fused),
         "notes": list(scene.notes),
         "comments": comments,
         "low_corner": statistics.low.tolist() if statistics.count else None,

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, spread
 from aaplug.core.conventions import MIP, Convention
 from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
@@ -47,7 +47,7 @@ class MatchedEnergy:
 
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
         """Fuse into scales and opacities.  A Gaussian that none of the fitted views sees keeps its opacity."""
-        views = training.cameras[:: -(-len(training.cameras) // FIT_VIEWS)]
+        views = spread(training.cameras, FIT_VIEWS)
         rates = median_rates(scene.means, training.cameras)
         widened = _widened(scene, rates, self.variance)
         factor = _mean_log_factor(scene, widened, views, training, self.shown)
