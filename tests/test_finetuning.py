@@ -16,9 +16,8 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.loop import advance, loss_at, run
-from aaplug.finetuning.losses import l2
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
-from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance
+from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, l2
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
 from aaplug.lab import mipmap_gs

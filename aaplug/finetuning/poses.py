@@ -16,7 +16,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.evaluation.protocols import median_depth
-from aaplug.finetuning.losses import l2
+from aaplug.finetuning.settings import l2
 from aaplug.io.photographs import photo_at
 from aaplug.rendering.renderer import Renderer
 

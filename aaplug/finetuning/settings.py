@@ -1,9 +1,12 @@
-"""How to fine-tune: the settings of a run, and aaplug's method of choosing them."""
+"""How to fine-tune: the settings of a run, aaplug's method of choosing them, and the loss that a step minimises."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
 
 from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import FAST, Viewer
@@ -90,3 +93,15 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
         loss=options.loss,
         seed=options.seed,
     )
+
+
+@runtime_checkable
+class Loss(Protocol):
+    """How far an image is from what it should show: 0 for equal images, and differentiable in the first."""
+
+    def __call__(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]: ...  # noqa: D102
+
+
+def l2(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean squared error (Mipmap-GS)."""
+    return (image - truth).square().mean()
