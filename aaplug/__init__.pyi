@@ -20,7 +20,7 @@ from .core.training import TrainingViews as TrainingViews
 
 # prepare and render
 from .methods.recipe import Recipe as Recipe
-from .methods.recipes import find_recipe as find_recipe
+from .methods.presets import find_recipe as find_recipe
 from .rendering.renderer import Renderer as Renderer
 
 # the command line's verbs, each as one call

@@ -32,7 +32,7 @@ from aaplug.evaluation.results import (
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, back_projected
 from aaplug.io.images import read_image, write_png
 from aaplug.methods import RECIPES
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FormatError, UsageError

@@ -14,7 +14,7 @@ from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D
-from aaplug.methods.recipes import suited
+from aaplug.methods.presets import suited
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, make_splats, sized

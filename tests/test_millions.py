@@ -11,8 +11,8 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.results import mean
 from aaplug.evaluation.truth import Truth
+from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import LevelChoice, Recipe
-from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer, own_look
 from tests.conftest import make_camera, make_scene
 

@@ -15,7 +15,7 @@ from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import CEILING, mean
 from aaplug.evaluation.truth import Truth
 from aaplug.methods import RECIPES
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer, own_look
 from tests.conftest import SAMPLE

@@ -24,8 +24,7 @@ from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.pixel_kernels.surfel import SURFEL
-from aaplug.methods.presets import NEIGHBOURS
-from aaplug.methods.recipes import find_recipe, suited
+from aaplug.methods.presets import NEIGHBOURS, find_recipe, suited
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.job import Job

@@ -32,8 +32,8 @@ from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, Measurement, Repor
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.methods.presets import suited
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import suited
 from aaplug.rendering.cost import COMPARED, Cost, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files

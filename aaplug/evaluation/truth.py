@@ -24,7 +24,7 @@ from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
 from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, not_one_of
 

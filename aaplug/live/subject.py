@@ -20,7 +20,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.live.messages import PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES, RECIPES
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError
 from aaplug.system.shells import command_line

@@ -26,8 +26,8 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.scene import Scene, without_harmonics
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
+from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.base import Options
 from aaplug.options.shared import FrameOptions, Orbit, RecipeOptions, ViewOptions
 from aaplug.options.verbs import ALL, IN_TIME

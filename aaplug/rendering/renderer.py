@@ -45,8 +45,8 @@ from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY, with_copies
+from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
-from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer, kernels_of
 from aaplug.rendering.passes import by_order, composited, expected

@@ -9,8 +9,8 @@ from aaplug.core.cameras import Camera
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike
+from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import LevelChoice
-from aaplug.methods.recipes import find_recipe
 from aaplug.options.shared import size_of
 from aaplug.options.verbs import BenchOptions
 from aaplug.rasterizers.tiled.ahead_of_time import build, load

@@ -7,7 +7,7 @@ from statistics import median
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.finetuning.poses import RefinedPose, refine_pose
 from aaplug.io.scenes import SceneLike
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.options.shared import ViewOptions
 from aaplug.options.verbs import PoseOptions
 from aaplug.rendering.job import CamerasLike, Job, running

@@ -19,7 +19,7 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.core.sampling import median_rates
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import scene_of
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.options.shared import Orbit
 from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.renderer import Renderer

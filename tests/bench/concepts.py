@@ -18,8 +18,8 @@ from aaplug.evaluation.report.plots import COLOURS, Plot
 from aaplug.lab.integral import INTEGRAL
 from aaplug.methods import SCREEN_FILTERS
 from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 
 RATE = 1 / 4  # of the small image, against training

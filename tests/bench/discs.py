@@ -14,8 +14,8 @@ from torch import Tensor
 import aaplug
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.projection import quats_of, rotation_matrices
+from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.verbs.warmup import warmup

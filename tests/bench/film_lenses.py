@@ -21,7 +21,7 @@ from aaplug.core.splats import Splats2D
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.methods.filters.matched import BY_GLOBAL_RATE
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.room import inside, matrices, room, turned

@@ -28,7 +28,7 @@ from aaplug.evaluation.metrics import flip
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.photographs import photo_at
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed

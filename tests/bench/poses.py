@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from aaplug.core.cameras import Camera
 from aaplug.finetuning.poses import RefinedPose, refine_pose
 from aaplug.io.photographs import photo_at
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
 from tests.bench.scenes import decibels, trained
