@@ -15,8 +15,6 @@ from itertools import product
 from os import PathLike
 from typing import Any
 
-from torch import Tensor
-
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.colours import Background
 from aaplug.core.gaussians import Gaussians
@@ -248,18 +246,22 @@ class ViewMeasurer:
 
     def __call__(self, index: int) -> tuple[int, tuple[Measurement, ...]]:
         """Measure every candidate at every scale."""
-        view, measurements = self.task.views[index], list[Measurement]()
+        view, measured, measurements = self.task.views[index], self.task.measured, list[Measurement]()
         truth = ViewTruth(self.task.truth, view)
         training_size: dict[str, TimedImage] = {}  # by candidate
         for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
-            compared = _Comparison(self.task.measured, truth.compared(scale))
+            expected, compared = truth.compared(scale), dict[TimedImage, Values]()
             for name, image in self._images(truth, scale):
                 if scale == 1 and self.task.resizes:
                     training_size[name] = image
                 series = None if name == CEILING else self._series(truth, name, scale, image, training_size.get(name))
-                values, note = compared(image, series)
+                if image not in compared:
+                    compared[image] = self._compared(image, expected)
+                values = {**compared[image], **{m.name: series and m.of(series) for m in measured if m.figure}}
+                undefined = [m.undefined for m in measured if m.measure and values[m.name] is None]
+                note = NO_PHOTOGRAPH if expected is None else "; ".join(dict.fromkeys(undefined))
                 if self.images is not None:
-                    self.images.keep(index, name, scale, image.rgb, compared.truth)
+                    self.images.keep(index, name, scale, image.rgb, expected)
                 cost = image.samples, image.seconds
                 measurements.append(Measurement(name, scale, view.name, values, *cost, note, image.evaluations))
         return index, tuple(measurements)
@@ -271,14 +273,23 @@ class ViewMeasurer:
         if truth.truth.source == "reference":
             images[_work(truth.truth.renderer, camera)] = truth.reference(scale)
         elif CEILING in self.task.rows:
-            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
             if scale == 1:
                 images[_work(truth.truth.renderer, camera)] = truth.look
+            yield CEILING, truth.look if scale == 1 else truth.look.resampled_to(truth.resized_look(scale))
         for name, renderer in self._renderers.items():
             work = _work(renderer.renderer, camera)
             if work not in images:
                 images[work] = renderer(camera)
             yield name, images[work]
+
+    def _compared(self, image: TimedImage, truth: Image | None) -> Values:
+        """Values of the metrics that compare with the truth; None where there is none."""
+        measures = [metric for metric in self.task.measured if metric.measure]
+        if truth is None:
+            return dict.fromkeys(metric.name for metric in measures)
+        rgb = quantised(image.rgb)
+        part = slice(EQUAL_IMAGES_SIDE if rgb.equal(truth) else None)
+        return {metric.name: metric.compare(rgb[part, part], truth[part, part]) for metric in measures}
 
     @cached_property
     def _renderers(self) -> dict[str, TimedRenderer]:
@@ -316,25 +327,3 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     fine, samples = renderer.sampled(camera)
     sampling = *renderer.sampling(camera), renderer.coarsening(fine, samples)
     return id(renderer.scene), id(renderer.training), method, sampling, renderer.background, renderer.rasterizer.name
-
-
-class _Comparison:
-    """Compares images with one truth, None where there is none; equal images are compared once."""
-
-    def __init__(self, metrics: Sequence[Metric], truth: Image | None):
-        self.metrics, self.truth = metrics, truth
-        self._results: list[tuple[Tensor, Values]] = []
-
-    def __call__(self, image: TimedImage, series: Series | None) -> tuple[Values, str]:
-        """Values by metric, and the reasons why some are undefined; the ceiling has no series, and so no figures."""
-        rgb, truth, measures = quantised(image.rgb), self.truth, [metric for metric in self.metrics if metric.measure]
-        values = next((earlier for other, earlier in self._results if rgb.equal(other)), None)
-        if truth is None:
-            values = dict.fromkeys(metric.name for metric in measures)
-        elif values is None:
-            part = slice(EQUAL_IMAGES_SIDE if rgb.equal(truth) else None)
-            values = {m.name: m.compare(rgb[part, part], truth[part, part]) for m in measures}
-            self._results.append((rgb, values))
-        values = {m.name: values[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
-        undefined = [metric.undefined for metric in measures if values[metric.name] is None]
-        return values, NO_PHOTOGRAPH if truth is None else "; ".join(dict.fromkeys(undefined))
