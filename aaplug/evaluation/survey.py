@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import check_frame, sampling_bounds
 from aaplug.evaluation.coverage import log_multiples
-from aaplug.io.scenes.scene import Scene, probes
+from aaplug.io.scenes.scene import Scene
 from aaplug.system.monitor import Tell
 
 PROBE_ROWS = 64  # Gaussians read at each place of the file
@@ -29,9 +29,7 @@ class Histogram:
 
     def add(self, values: Float[Tensor, " n"]) -> None:
         """Count values."""
-        share = (values.double() - self.low) / (self.high - self.low)
-        bins = (share * BINS).clamp(0, BINS - 1).long()
-        self.counts += torch.bincount(bins, minlength=BINS)
+        self.counts += torch.histc(values.double().clamp(self.low, self.high), BINS, self.low, self.high).long()
 
     def quantile(self, share: float) -> float | None:
         """Middle of the bin that holds this quantile; None without values."""
@@ -107,7 +105,4 @@ def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda do
 
 def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:
     """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
-    means = [opened.load(rows.start, rows.stop).means for rows in probes(opened.count, PROBE_ROWS)]
-    sample = torch.cat(means) if means else torch.zeros(0, 3)
-    sample = sample[sample.isfinite().all(dim=1)]
-    return check_frame(sample, cameras, opened.name, min_seen)
+    return check_frame(opened.sample(PROBE_ROWS).means, cameras, opened.name, min_seen)
