@@ -5,13 +5,13 @@ independently; `aaplug.finetuning` can then optimize all of them together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from aaplug.core.conventions import MIP, Convention
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters.energy import MatchedEnergy
-from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
+from aaplug.methods.filters.energy import MATCHED_ENERGY, MatchedEnergy
+from aaplug.methods.filters.smoothing import BY_VOLUME, Smoothing3D, fuse_stored
 from aaplug.methods.viewers import Viewer
 from aaplug.system.errors import UsageError
 
@@ -19,39 +19,25 @@ FITTED_VARIANCE = 0.1  # px² at the median training rate, best measured; from u
 TUNED = "finetune"  # method that fine-tuning records in `Gaussians.fused`; it adds no blur
 MERGED = "merge"  # method that levels of detail record; it keeps what blur there is
 
-
-@dataclass(frozen=True)
-class Form:
-    """A closed-form conversion to the Mip rule.
-
-    uses_bounds: the filter reads `TrainingViews.bounds`; if not, only the cameras.
-    skips: convention of the scenes that need no conversion; None if all need one.
-    """
-
-    filter: MatchedEnergy | Smoothing3D
-    uses_bounds: bool
-    skips: Convention | None = None
-
-
-MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
-MIP_SPLATTING = Form(Smoothing3D(), uses_bounds=True)
+Form = MatchedEnergy | Smoothing3D  # a closed-form conversion to the Mip rule
+FORMS: dict[str, Form] = {"matched-energy": MATCHED_ENERGY, "mip-splatting": BY_VOLUME}
 MERGE_ALONE = "`aaplug merge` of it alone changes the format"
-FORMS = {"matched-energy": MATCHED_ENERGY, "mip-splatting": MIP_SPLATTING}
 
 
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
     """Convert a scene to the Mip rule: fuse its stored 3D filter, or apply `form` if it stores none.
 
-    2D Gaussians keep their rule; `MIP_SPLATTING` smooths them within their planes.
+    2D Gaussians keep their rule; `Smoothing3D` smooths them within their planes.
 
     training: may be None if the scene stores a 3D filter.
 
     Raises UsageError if something is fused already, the scene needs nothing, or cameras are missing.
     """
-    if not (scene.flat and isinstance(form.filter, Smoothing3D)):
+    smooths = isinstance(form, Smoothing3D)
+    if not smooths:
         _check_discs(scene)
     _check_unblurred(scene)
-    if form.skips == scene.convention and scene.filter_3d is None:
+    if not smooths and scene.convention == MIP and scene.filter_3d is None:
         problem = "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse"
         raise UsageError(scene.name, f"{problem}; {MERGE_ALONE}")
     if scene.filter_3d is not None:
@@ -59,7 +45,7 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
     elif training is None:
         raise UsageError(scene.name, "has no stored 3D filter: its conversion needs the training cameras")
     else:
-        converted = form.filter(scene, training)
+        converted = form(scene, training)
     return converted if scene.flat else replace(converted, convention=MIP)
 
 

@@ -20,6 +20,7 @@ from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
 from aaplug.io.scenes.scene import PART, Scene, SceneFrames
 from aaplug.methods.conversion import FORMS, Form, blurring, fuse
+from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -79,8 +80,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     if rule is None:
         rule = FORMS[options.form or ("mip-splatting" if job.scene.flat else "matched-energy")]
         if options.variance is not None:
-            how: Any = replace(rule.filter, variance=options.variance)
-            rule = replace(rule, filter=how)
+            rule = replace(rule, variance=options.variance)
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     frames = job.scene.frames
     if frames is not None and isinstance(rule, Viewer):
@@ -164,7 +164,7 @@ def convert_parts(
     tell: called with (Gaussians done, Gaussians in all).
     size: Gaussians per part.  threads: parts converted at once.
     """
-    bounded, coarsest = bool(cameras) and form.uses_bounds, math.inf
+    bounded, coarsest = bool(cameras) and isinstance(form, Smoothing3D), math.inf
     for part in scene.parts(size) if bounded else ():
         bounds = sampling_bounds(part.means, cameras)
         if bounds.seen.any():
@@ -173,7 +173,7 @@ def convert_parts(
     def converted(part: Gaussians) -> Gaussians:
         if not cameras:
             return fuse(part, None, form)
-        none = torch.zeros(len(part))  # where the form reads no bounds
+        none = torch.zeros(len(part))  # matched energy reads no bounds
         bounds = SamplingBounds(none, none, none, none.int())
         if bounded:
             bounds = sampling_bounds(part.means, cameras)
