@@ -21,7 +21,6 @@ from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
-BASIS = "flavours", "protocols", "truths", "ways of downscaling"  # what `Report.basis` holds
 TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
 MILLION = 1e6
 
@@ -90,10 +89,11 @@ class Report:
         """Why values are undefined, each reason once."""
         return list(dict.fromkeys(m.note for m in self.measurements if m.note))
 
-    def basis(self, metric: str) -> list[Any]:
+    def basis(self, metric: str) -> dict[str, Any]:
         """What decides on a metric's figures beside scene and recipe; those of another basis do not compare."""
-        parts = ("protocol", "truth", "downscale")
-        return [self.protocol.get("metrics", {}).get(metric), *map(self.protocol.get, parts)]
+        parts = {"protocols": "protocol", "truths": "truth", "ways of downscaling": "downscale"}
+        flavour = self.protocol.get("metrics", {}).get(metric)
+        return {"flavours": flavour} | {words: self.protocol.get(key) for words, key in parts.items()}
 
     def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
         """Measurements of every view."""
@@ -184,7 +184,7 @@ def tables(report: Report) -> list[Table | str]:
         rows = metric_cells(report, metric)
         lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows]
         grids += metric_grid(title, [report], metric, lines, "italic")
-    for title, rows in cost_cells(report):
+    for title, _, rows in cost_cells(report):
         grids.append(grid(title, report, [[cell.text for cell in row] for row in rows]))
     return grids
 
@@ -206,8 +206,8 @@ def metric_grid(
     why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
     if any(scale not in each.scales for each in reports for scale in empty):
         why = "some scenes have other scales"
-    bases = zip(BASIS, *(each.basis(metric.name) for each in reports), strict=True)
-    if differing := [part for part, *values in bases if any(value != values[0] for value in values)]:
+    first, *others = (each.basis(metric.name) for each in reports)
+    if differing := [part for part in first if any(other[part] != first[part] for other in others)]:
         why = f"the scenes' {' and '.join(differing)} differ"
     return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 
@@ -246,8 +246,8 @@ def metric_cells(report: Report, metric: Metric) -> list[list[Cell]]:
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def cost_cells(report: Report) -> list[tuple[str, list[list[Cell]]]]:
-    """Tables of a view's cost, recipes down and scales across, as (title, rows)."""
+def cost_cells(report: Report) -> list[tuple[str, str, list[list[Cell]]]]:
+    """Tables of a view's cost, recipes down and scales across, as (title, meaning, rows)."""
 
     def time(views: Sequence[Measurement]) -> Cell:
         times = [m.seconds for m in views]
@@ -261,11 +261,13 @@ def cost_cells(report: Report) -> list[tuple[str, list[list[Cell]]]]:
         spread = f"± {number(stdev(millions), COUNT_DIGITS)}" if len(millions) > 1 else ""
         return Cell(number(_mean(millions), COUNT_DIGITS), spread=spread)
 
-    columns = [("seconds per view, median", time)]
+    about = "rendering alone, on the machine that the protocol names; below, the quartiles over the views"
+    columns = [("seconds per view, median", about, time)]
     if any(m.evaluations is not None for m in report.measurements):
-        columns.append(("million evaluations per view", evaluations))
+        about = "splat-pixel evaluations of compositing; below, the standard deviation over the views"
+        columns.append(("million evaluations per view", about, evaluations))
     views = [[report.select(recipe, scale) for scale in report.scales] for recipe in report.recipes]
-    return [(title, [[cell(each) for each in row] for row in views]) for title, cell in columns]
+    return [(title, about, [[cell(each) for each in row] for row in views]) for title, about, cell in columns]
 
 
 def results(report: Report) -> dict[str, Any]:

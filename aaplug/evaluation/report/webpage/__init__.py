@@ -21,10 +21,6 @@ from aaplug.evaluation.report.plots import BOUNDS, Plot
 from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, cost_cells, mean, metric_cells, scale_name
 from aaplug.io.images import encoded, image_size, read_image
 
-COSTS = (  # the meaning of the tables of `cost_cells`
-    "rendering alone, on the machine that the protocol names; below, the quartiles over the views",
-    "splat-pixel evaluations of compositing; below, the standard deviation over the views",
-)
 LOSSLESS_BYTES = 12_000_000  # of all images; a larger page opens slowly and gets lossy ones
 LOSSY_QUALITY = 90  # of WebP
 TRUTH = "truth"  # the role of the true image, beside the recipes
@@ -38,7 +34,7 @@ def page(
     """The page's text; raises FormatError where an image that it shows is missing.  facts: further tables."""
     variants = report.protocol.get("metrics", {})
     tables = [(m.title, variants.get(m.name, m.protocol), metric_cells(report, m)) for m in report.metrics]
-    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, cost_cells(report), strict=False)]
+    tables += cost_cells(report)
     return assembled(
         __name__,
         "page.html.j2",
