@@ -43,17 +43,12 @@ def page(
         name=name,
         kind="comparison" if facts else "evaluation",
         report=report,
-        protocol=dict(report.protocol),
         scales=[scale_name(scale) for scale in report.scales],
         ceiling=CEILING,
         headline=_headline(report),
-        tables=[
-            {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
-            for title, about, cells in tables
-        ],
+        tables=tables,
         fact_tables=facts,
         against=AGAINST[report.protocol["truth"]],
-        notes=report.notes,
         coverage=bounds,
         scale_name=scale_name,
         plots=[(plot, Markup(plot.inline_svg())) for plot in plots],
