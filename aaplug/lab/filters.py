@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.convolution import face_log_factor, smoothed_by
-from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
+from aaplug.core.convolution import smoothed_by
+from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.projection import rotation_matrices, slope_limits
 from aaplug.core.sampling import mean_position, rates_in_chunks
 from aaplug.core.splats import Splats2D
@@ -58,17 +58,11 @@ class FlatSmoothing:
 
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
         """Fuse the smoothing into scales and opacities."""
-        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()[:, None]
-        smoothed = smoothed_by(scene, log_sigma, volume=False)
-        thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
-        thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
-        logits = scale_opacities(scene.logit_opacities, face_log_factor(scene.log_scales, log_sigma))
-        return replace(
-            smoothed,
-            log_scales=torch.where(thin, scene.log_scales, smoothed.log_scales),
-            logit_opacities=logits,
-            fused=(*scene.fused, Fusion("flat smoothing", {"variance": f"{self.variance:g}"})),
-        )
+        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()[:, None].repeat(1, 3)
+        log_sigma.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), -torch.inf)
+        smoothed = smoothed_by(scene, log_sigma, volume=True)
+        fusion = Fusion("flat smoothing", {"variance": f"{self.variance:g}"})
+        return replace(smoothed, fused=(*scene.fused, fusion))
 
 
 def view_information(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, "n 3 3"]:
