@@ -20,9 +20,8 @@ from torch import Tensor
 
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
-from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.lab.integral import INTEGRAL, principal_columns
+from aaplug.lab.integral import Integral, principal_columns
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, rows_of
 
 GAMMA, BETA = 0.5, 2.0  # the third party's guesses; beta is per px
@@ -32,25 +31,20 @@ HALF_U, HALF_V, NODES, FIRST_WEIGHT = range(COLUMNS, COLUMNS + 4)
 
 
 @dataclass(frozen=True)
-class Elliptical:
-    """Alpha is opacity times the weighted mean of the Gaussian at the nodes.
+class Elliptical(Integral):
+    """Alpha is opacity times the weighted mean of the Gaussian at the nodes, which lie within the square of `Integral`.
 
     gamma: weight of the elongation, which counts only where the sum is not `normalized`.
     beta: decrease of a node's weight with its distance from the pixel's edge, per px.
     normalized: the sum is divided by that of the weights; else by the number of nodes.
     """
 
+    name: str = "eaa"
+    columns: int = FIRST_WEIGHT + MOST_NODES // 2
+    splats_per_pass: int = 4
     gamma: float = GAMMA
     beta: float = BETA
     normalized: bool = True
-    name: str = "eaa"
-    columns: int = FIRST_WEIGHT + MOST_NODES // 2
-    needs_depth_slopes: bool = False
-    splats_per_pass: int = 4
-
-    def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Those of `Integral`: the nodes lie within its square."""
-        return INTEGRAL.bounding_ellipses(splats, rules)
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
         """Principal axes, the half windows along them, the number of nodes, and what each ring adds to a weight."""
