@@ -77,16 +77,14 @@ class Plot:
 
 def plots(report: Report, bounds: Coverage) -> list[Plot]:
     """The plots of a report: metrics against the truth and work over scale, and the sampling bounds."""
-    curves = []
-    for metric in report.compared:
-        curves.append(_curves(plot_name(metric.name), metric.title, partial(_mean, metric), report))
+    curves = [_curves(plot_name(m.name), m.title, partial(_mean, m), report) for m in report.compared]
     title = "million splat-pixel evaluations per view"
     curves.append(_curves(EVALUATIONS, title, million_evaluations, report, from_zero=True))
     title, above = "share of the splats' energy above the Nyquist rate", bounds.above_nyquist
     curves.append(_curves(ABOVE_NYQUIST, title, lambda _, *at: above.get(at), report, from_zero=True))
     share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
-    return [*(plot for plot in curves if plot is not None), Plot(BOUNDS, words, partial(_histogram, bounds))]
+    return [*filter(None, curves), Plot(BOUNDS, words, partial(_histogram, bounds))]
 
 
 def plot_name(metric: str) -> str:
