@@ -90,7 +90,7 @@ def differences(reference: Gaussians, other: Gaussians) -> Differences | None:
     same_rows = float(moves.median()) <= SAME_ROWS_DISTANCE * float(distances.median())
     if not same_rows:
         there, back = _nearest(reference, other), _nearest(other, reference)
-        mutual = (back[there] == torch.arange(len(reference))).nonzero()[:, 0]
+        mutual = back[there] == torch.arange(len(reference))
         first, second = reference[mutual], other[there[mutual]]
     a, b = (scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).sort(dim=1).values for scene in (first, second))
     most = max(first.sh.shape[1], second.sh.shape[1])

@@ -93,8 +93,8 @@ def densify(
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in (*WHOLE, "sh")}
     denser = replace(parts[0], **columns, origin=None, extras={})
     new = torch.arange(len(sources)) >= len(unsplit)
-    visible = (denser.opacities >= MIN_OPACITY).nonzero()[:, 0]
-    if not len(visible):
+    visible = denser.opacities >= MIN_OPACITY
+    if not visible.any():
         return Densification(scene, torch.arange(len(scene)), torch.zeros(len(scene), dtype=torch.bool))
     return Densification(denser[visible], sources[visible], new[visible])
 

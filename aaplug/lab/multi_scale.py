@@ -50,8 +50,7 @@ class _Part(NamedTuple):
         return cls(joined([part.scene for part in parts]), torch.cat([part.level for part in parts]))
 
     def where(self, mask: Bool[Tensor, " n"]) -> "_Part":
-        rows = mask.nonzero()[:, 0]
-        return _Part(self.scene[rows], self.level[rows])
+        return _Part(self.scene[mask], self.level[mask])
 
 
 def in_one_scene(
@@ -113,5 +112,5 @@ def _merged(large: _Part, small: _Part, rates: Float[Tensor, " s"], level: int) 
         replace(clusters, rates=clusters.rates * _highest_rate(torch.tensor(level))), small.scene, covered.weights
     )
     replaced = counts[clusters.labels] > 1
-    fresh = _Part.of(merged[(counts > 1).nonzero()[:, 0]], level)
+    fresh = _Part.of(merged[counts > 1], level)
     return _Part.joined([large, small.where(~replaced), fresh]), small.where(replaced)

@@ -156,7 +156,7 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
             ceiling = tolerance if goal.tolerance == math.inf else goal.tolerance
             edges = edges_below(clusters, goal.rate, ceiling, goal.smallest)
         while len(clusters) > least:
-            below = edges if tolerance == ceiling else edges[(edges.cost <= tolerance).nonzero()[:, 0]]
+            below = edges if tolerance == ceiling else edges[edges.cost <= tolerance]
             pairs = matching(below, len(clusters))
             pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
             is_last = len(pairs) <= min_share * len(clusters)
@@ -165,7 +165,7 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
                 fresh = torch.zeros(len(clusters), dtype=torch.bool)
                 fresh[places[pairs.one]] = True
                 edges = Edges(places[edges.one], places[edges.other], edges.cost)
-                edges = edges[(~(fresh[edges.one] | fresh[edges.other])).nonzero()[:, 0]]
+                edges = edges[~(fresh[edges.one] | fresh[edges.other])]
                 edges = Edges.joined([edges, edges_below(clusters, goal.rate, ceiling, goal.smallest, fresh)])
                 tell(first - len(clusters))
             if is_last:

@@ -55,7 +55,8 @@ class Edges:
         return len(self.cost)
 
     def __getitem__(self, index: Tensor) -> "Edges":
-        """The pairs at `index`."""
+        """The pairs at `index`, a mask or places."""
+        index = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         return Edges(self.one[index], self.other[index], self.cost[index])
 
     def cheapest(self, values: Tensor, count: int) -> "Edges":
@@ -64,7 +65,7 @@ class Edges:
         least = torch.full((count,), highest, dtype=values.dtype)
         for ends in (self.one, self.other):
             least.scatter_reduce_(0, ends, values, "amin")
-        return self[((values == least[self.one]) & (values == least[self.other])).nonzero()[:, 0]]
+        return self[(values == least[self.one]) & (values == least[self.other])]
 
 
 def matching(edges: Edges, count: int) -> Edges:
@@ -79,7 +80,7 @@ def matching(edges: Edges, count: int) -> Edges:
         parts.append(pairs)
         free = torch.ones(count, dtype=torch.bool)
         free[pairs.one] = free[pairs.other] = False
-        edges = edges[(free[edges.one] & free[edges.other]).nonzero()[:, 0]]
+        edges = edges[free[edges.one] & free[edges.other]]
     return Edges.joined(parts) if parts else edges
 
 
