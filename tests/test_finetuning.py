@@ -258,15 +258,15 @@ def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stoppe
     assert run(job, whole, every=2)
     first, kept = begin(job), []
 
-    def keep(state, good):
-        save(tmp_path / "run.pt", job, state, good)
-        kept.append(good)
+    def keep(state):
+        save(tmp_path / "run.pt", job, state)
+        kept.append(state.good)
 
     assert not run(job, first, every=2, keep=keep, stop=lambda: first.step == stopped_at)
-    again, good = load(tmp_path / "run.pt", job)
+    again = load(tmp_path / "run.pt", job)
     assert again.step == stopped_at
-    assert good["step"] == 2
-    assert run(job, again, good, every=2, keep=keep)
+    assert again.good["step"] == 2
+    assert run(job, again, every=2, keep=keep)
     assert (again.step, again.curve) == (whole.step, whole.curve)
     for name, leaf in again.leaves.items():
         assert torch.equal(leaf, whole.leaves[name]), name
@@ -317,7 +317,7 @@ def test_after_three_bad_steps_a_run_rolls_back_and_says_so(monkeypatch):
 
 def test_checkpoints_of_others_are_refused(tmp_path):
     job, path = make_job(), tmp_path / "run.pt"
-    save(path, job, begin(job), {})
+    save(path, job, begin(job))
     for content in (b"not a checkpoint", path.read_bytes()[:-100]):
         (tmp_path / "damaged.pt").write_bytes(content)
         with pytest.raises(FormatError, match="damaged"):
@@ -355,7 +355,7 @@ CHANGES = {
 @pytest.mark.parametrize("key", CHANGES)
 def test_a_checkpoint_is_of_all_that_the_result_depends_on(tmp_path, key):
     job, path = make_job(), tmp_path / "run.pt"
-    save(path, job, begin(job), {})
+    save(path, job, begin(job))
     with pytest.raises(UsageError, match=f"its {key} was"):
         load(path, CHANGES[key](job))
 
@@ -366,7 +366,7 @@ def test_a_checkpoint_is_of_its_photographs(tmp_path):
     job = make_job()
     views = [replace(view, photo=photo) for view in job.views]
     job = replace(job, views=views, truth=replace(job.truth, source="photographs"))
-    save(path, job, begin(job), {})
+    save(path, job, begin(job))
     write_png(photo, torch.ones(*VIEWS[0].hw, 3), overwrite=True)
     with pytest.raises(UsageError, match="its photographs was"):
         load(path, replace(job))
@@ -377,7 +377,7 @@ def test_what_a_run_depends_on_is_hashed_once(tmp_path, monkeypatch):
     told = "aaplug.finetuning.state.digest_of_scene"
     monkeypatch.setattr(told, lambda scene: hashed.append(scene) or digest_of_scene(scene))
     for _ in range(3):
-        save(tmp_path / "run.pt", job, begin(job), {})
+        save(tmp_path / "run.pt", job, begin(job))
     assert len(hashed) == 2  # the start, and the truth's scene
 
 

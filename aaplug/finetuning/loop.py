@@ -5,8 +5,7 @@ therefore equals an uninterrupted one, bit for bit.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -34,24 +33,21 @@ SCALE_SEED = 3_000_000  # added for the scale of a step
 def run(
     job: TuningJob,
     state: State,
-    fallback: Mapping[str, Any] | None = None,
     *,
     every: int = 100,
-    keep: Callable[[State, Mapping[str, Any]], None] = lambda state, fallback: None,
+    keep: Callable[[State], None] = lambda state: None,
     stop: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = lambda text: None,
 ) -> bool:
     """Step until the job is done or `stop()` is true; return True if it is done.
 
     state: where to begin; changed in place.
-    fallback: snapshot of the state to return to; None for the given one.
-    every: steps between calls of `keep`.
-    keep: called with the state and the snapshot to fall back to, also when the run stops.
+    every: steps between calls of `keep`, which is also called when the run stops.
     stop: asked before every step.  say: called when the run rolls back.
 
     Raises UsageError if no step has a finite gradient, at any learning rate, or the loss breaks its interface.
     """
-    fallback = fallback or snapshot(state)
+    state.good = state.good or snapshot(state)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
         if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
@@ -59,15 +55,15 @@ def run(
             if rollbacks > MAX_ROLLBACKS:
                 problem = f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks"
                 raise UsageError("finetune", problem)
-            vars(state).update(vars(state_of(fallback, job)))
+            vars(state).update(vars(state_of(state.good, job, state.good)))
             state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
-            back = f"back to step {fallback['step']}, at half the learning rates"
+            back = f"back to step {state.good['step']}, at half the learning rates"
             say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
         if state.step % every == 0 and not state.bad_steps:
-            fallback = snapshot(state)
-            keep(state, fallback)
+            state.good = snapshot(state)
+            keep(state)
     if state.step % every or state.bad_steps:
-        keep(state, fallback)
+        keep(state)
     return state.step >= job.settings.steps
 
 

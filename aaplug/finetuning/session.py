@@ -34,15 +34,15 @@ def tune(
     raise KeyboardInterrupt.
     """
     if resume and checkpoint is not None and checkpoint.exists():
-        state, fallback = load(checkpoint, job)
+        state = load(checkpoint, job)
         monitor.say(f"resumed at step {state.step}")
     else:
-        state, fallback = begin(job), None
+        state = begin(job)
         if resume:
             monitor.say("there is no checkpoint yet: starting at step 0")
     steps, first, started = job.settings.steps, state.step, time.monotonic()
 
-    def keep(state: State, fallback: Mapping[str, Any]) -> None:
+    def keep(state: State) -> None:
         """Measure a few training views at the training size and the farthest scale; write the checkpoint; say both."""
         scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
         now = Candidate("now", replace(state, group=None).renderer(job))
@@ -54,7 +54,7 @@ def tune(
         values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
         decibels = ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
         if checkpoint is not None:
-            save(checkpoint, job, state, fallback)
+            save(checkpoint, job, state)
         pace = (time.monotonic() - started) / max(1, state.step - first)
         monitor.say(f"step {state.step} of {steps}{loss}: {decibels}; {pace:.2f} s per step")
 
@@ -64,7 +64,7 @@ def tune(
             tell(state.step, steps)
             return interrupted()
 
-        done = run(job, state, fallback, every=every, keep=keep, stop=stop, say=monitor.say)
+        done = run(job, state, every=every, keep=keep, stop=stop, say=monitor.say)
         if done:
             tell(steps, steps)
     if not done:

@@ -85,6 +85,7 @@ class State:
     bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.
     curve: number, view and loss by scale of each step.  probes: PSNR measured on the way.
+    good: snapshot of the state to return to; empty before the first step.
     """
 
     step: int
@@ -98,6 +99,7 @@ class State:
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
     probes: list[dict[str, Any]] = field(default_factory=list)
+    good: Mapping[str, Any] = field(default_factory=dict)
 
     def scene(self, job: TuningJob) -> Gaussians:
         """The scene as it is now."""
@@ -133,28 +135,29 @@ def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
 
 
 def snapshot(state: State) -> dict[str, Any]:
-    """A copy of the state, which later steps do not change, in types that a file can hold."""
+    """A copy of the state but for `good`, which later steps do not change, in types that a file can hold."""
     leaves = {name: leaf.detach() for name, leaf in state.leaves.items()}
-    return deepcopy({**vars(state), "leaves": leaves, "adam": state.adam.state_dict(), "bounds": vars(state.bounds)})
+    parts = {"leaves": leaves, "adam": state.adam.state_dict(), "bounds": vars(state.bounds)}
+    return deepcopy({name: parts.get(name, value) for name, value in vars(state).items() if name != "good"})
 
 
-def state_of(data: Mapping[str, Any], job: TuningJob) -> State:
-    """The state of a snapshot; they share no tensor."""
+def state_of(data: Mapping[str, Any], job: TuningJob, good: Mapping[str, Any]) -> State:
+    """The state of a snapshot; they share no tensor.  good: see `State`."""
     values = deepcopy(dict(data))
     adam = optimizer(values["leaves"], job.settings)
     adam.load_state_dict(values["adam"])
-    return State(**values | {"adam": adam, "bounds": SamplingBounds(**values["bounds"])})
+    return State(**values | {"adam": adam, "bounds": SamplingBounds(**values["bounds"])}, good=good)
 
 
-def save(path: Path, job: TuningJob, state: State, fallback: Mapping[str, Any]) -> None:
-    """Write the state and the snapshot to fall back to; if that fails, an older checkpoint is still whole."""
+def save(path: Path, job: TuningJob, state: State) -> None:
+    """Write the state; if that fails, an older checkpoint is still whole."""
     facts = {"format": FORMAT, "version": VERSION, "job": job.facts}
     with replacing(path, overwrite=True) as stream:
-        torch.save(facts | {"state": snapshot(state), "good": dict(fallback)}, stream)
+        torch.save(facts | {"state": snapshot(state), "good": dict(state.good)}, stream)
 
 
-def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
-    """The state of a run of this job, and the snapshot to fall back to.
+def load(path: Path, job: TuningJob) -> State:
+    """The state of a run of this job.
 
     Raises FormatError if the file is none of this version, and UsageError, which names a difference, for another job.
     """
@@ -168,7 +171,7 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
             if (before := content["job"].get(key)) != value:
                 problem = f"is of another run: its {key} was {printable(str(before))}, now it is {value}"
                 raise UsageError(str(path), problem)
-        return state_of(content["state"], job), content["good"]
+        return state_of(content["state"], job, content["good"])
     except AaplugError:
         raise
     except Exception as error:  # torch raises all kinds over a damaged file

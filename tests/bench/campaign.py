@@ -145,7 +145,7 @@ def others() -> dict[str, Target]:
     job = make_job(5)
 
     def checkpoint(folder: Path) -> Path:
-        save(folder / "run.pt", job, begin(job), {})
+        save(folder / "run.pt", job, begin(job))
         return folder / "run.pt"
 
     def resume(path: Path) -> None:
