@@ -27,14 +27,13 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians, digest_of_scene
-from aaplug.evaluation.alignment import mismatch
+from aaplug.evaluation.alignment import PAIR_DISTANCE, mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Report, mean, spread_of, tables
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FrameError, printable
 
-SAME_ROWS_DISTANCE = 0.01  # of the scene's size: the median distance within which rows are the same Gaussians
 GUARDED = (
     "the lowest, over later scenes and scales, of the mean PSNR of views whose images differ, in dB; null if none do"
 )
@@ -87,7 +86,7 @@ def differences(reference: Gaussians, other: Gaussians) -> Differences | None:
     first, second = reference, other
     distances = (reference.means.double() - reference.means.double().median(dim=0).values).norm(dim=1)
     moves = (reference.means.double() - other.means.double()).norm(dim=1)
-    same_rows = float(moves.median()) <= SAME_ROWS_DISTANCE * float(distances.median())
+    same_rows = float(moves.median()) <= PAIR_DISTANCE * float(distances.median())
     if not same_rows:
         there, back = _nearest(reference, other), _nearest(other, reference)
         mutual = back[there] == torch.arange(len(reference))

@@ -61,7 +61,7 @@ class Spot(NamedTuple):
 class Test:
     """A scene and what it tests.
 
-    tolerance: root mean square of the difference to the expected picture in any patch and channel, in levels of 255.
+    tolerance: largest `Finding.error` of a picture that is right.
     """
 
     name: str
@@ -329,7 +329,7 @@ class _Seen:
         return draw(self.test.scene, viewer, fault, self.white)
 
     def error(self, viewer: Viewer, fault: Fault = NONE) -> float:
-        """Root mean square of the difference to a picture in the patch and channel where it is largest, in levels."""
+        """`Finding.error` against the picture with a fault."""
         key = viewer.name, fault.words
         if key not in self.errors:
             squares = (self.expected(viewer, fault) - self.picture).square()

@@ -15,7 +15,7 @@ import torch
 from aaplug.core.camera_paths import free_views
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians, joined
-from aaplug.evaluation.truth import Truth
+from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import Settings
@@ -31,7 +31,6 @@ MAX_POSES = 100  # training poses
 VIEWS_BETWEEN = 2  # views between two poses, which are drawn like training's
 FREE_VIEW_EVERY = 4  # one view out of so many is free
 PROBE_VIEWS = 6  # views that tell whether tuning helped; it does not use them
-IMAGE_MEMORY = 1e9  # bytes of the images to compare with
 BYTES_PER_PIXEL = 6
 # The tuned views take these sizes in turn, as multiples of the training size.  A level is drawn alone at 1 to 3/2 times
 # its own rate and fades out below, so it learns these rates.  Its truth has the same sizes: whole boxes do not blur
@@ -74,7 +73,7 @@ def refine(
     steps = round(steps * min(MAX_STEPS_FACTOR, max(1.0, USUAL_STEPS_RATE / rate)))
     scales = (rate, *(rate * size for size in smaller))
     views, probes = _views(poses, scales, steps)
-    truth = Truth(look, memory=IMAGE_MEMORY)
+    truth = Truth(look, memory=MEMORY)
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
         look = replace(look, recipe=recipe_of(viewer))
@@ -113,7 +112,7 @@ def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tupl
     sizes = [size for size in VIEW_SIZES if size * scales[0] <= 1] or [1.0]
     area = sum(scale**2 for scale in scales) * statistics.mean(size**2 for size in sizes)
     largest = max(camera.width * camera.height for camera in poses)
-    count = max(1, min(steps, int(IMAGE_MEMORY / (BYTES_PER_PIXEL * area * largest))))
+    count = max(1, min(steps, int(MEMORY / (BYTES_PER_PIXEL * area * largest))))
     between = [view.as_trained() for view in free_views(poses, VIEWS_BETWEEN)]
     as_trained = spread([*poses, *between], count - count // FREE_VIEW_EVERY)
     repeats = min(len(sizes), count - count // FREE_VIEW_EVERY) // len(as_trained)  # few views take several sizes each

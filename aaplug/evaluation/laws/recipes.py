@@ -17,6 +17,7 @@ from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 
 from .base import law_of, make_camera, make_scene, require
+from .filters import CAMERAS
 
 SIDE, APART = 168, 40  # px
 CAMERA = make_camera(size=(SIDE, SIDE))
@@ -88,11 +89,10 @@ def difference_to_training(recipe: Recipe) -> float:
 
 @cache
 def _training_images(recipe: Recipe) -> list[Tensor]:
-    cameras = [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (3.0, -4.0, 1.0))]
     scene = make_scene(60)
     scene = replace(scene, logit_opacities=scene.logit_opacities + OPAQUE)
-    renderer = Renderer.of(with_columns(scene, torch.arange(60) % 4 == 0), cameras, recipe, rasterizer="eager")
-    return [renderer(camera).rgb for camera in cameras]
+    renderer = Renderer.of(with_columns(scene, torch.arange(60) % 4 == 0), CAMERAS[:2], recipe, rasterizer="eager")
+    return [renderer(camera).rgb for camera in CAMERAS[:2]]
 
 
 @law_of("recipe")
