@@ -244,7 +244,7 @@ def compare(words: Words) -> Answer:
         raise UsageError("fail_under", "is of PSNR, which `metric` leaves out")
     from aaplug.verbs.compare import check_compared
 
-    check_compared(words.output, words.resume, words.overwrite)  # before anything is read
+    check_compared(words.output, words.resume, words.overwrite, words.show)  # before anything is read
     scenes = [open_scene(words, path) for path in paths]
     cameras = read_cameras(words, scenes[0])
     comparison = aaplug.compare(scenes, cameras, words.output, **told(words, verbs.CompareOptions))

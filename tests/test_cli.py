@@ -118,6 +118,7 @@ REFUSED = {
     "guide nosuch": ["error: NAME: 'nosuch' is not one of"],
     "render gone.ply --cameras . -o new": ["gone.ply"],
     "render gone.ply -o new --background nocolour": ["--background: takes auto or an opaque colour as CSS writes it"],
+    "render gone.ply -o new --background transparent": ["--background: takes", "; --transparent is for"],
     "render scene.ply --cameras gone -o new": ["gone"],
     "render scene.ply --cameras . -o new.png --views train": ["new.png", "3 images"],
     f"{BARE} --up 0 0 0": ["--up: takes a direction"],

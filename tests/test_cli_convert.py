@@ -9,6 +9,7 @@ import torch
 
 from aaplug.core.conventions import MIP, PLAYCANVAS
 from aaplug.core.gaussians import Fusion
+from aaplug.evaluation.engine import evaluate
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 
@@ -83,7 +84,14 @@ def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention
     assert read_scene(Path("c.ply")).gaussians().convention == convention
 
 
-def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
+def test_convert_for_a_viewer_prints_the_residual_as_json(cli, monkeypatch):
+    measured = list[str]()
+
+    def noted(task, **how):
+        measured.extend(candidate.name for candidate in task.candidates)
+        return evaluate(task, **how)
+
+    monkeypatch.setattr("aaplug.finetuning.fitting.evaluate", noted)
     code, out, _ = cli(f"{CONVERT} --viewer mip --steps 0 --json")
     found = json.loads(out)
     assert code == 0
@@ -91,6 +99,8 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
     residual = found["residual"]
     assert residual["_aaplug"]["truth"] == "self"
     assert residual["converted@1"]["PSNR"] > residual["original@1"]["PSNR"]
+    assert residual["converted@1"] == residual["closed form@1"]
+    assert measured == ["original", "closed form"]
 
 
 def test_convert_for_the_rule_of_training_changes_no_byte(cli):

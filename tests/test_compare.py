@@ -228,6 +228,7 @@ REFUSED = {
     "compare scene.ply other.ply other.ply": "other.ply: is named twice",
     "compare scene.ply other.ply --fail-under 40db": "--fail-under: takes 0..200",
     "compare scene.ply other.ply --resume": "--resume: needs a folder",
+    "compare scene.ply other.ply --show 2": "--show: needs a folder",
     "compare scene.ply other.ply --views nothing": "there is no view 'nothing'",
 }
 

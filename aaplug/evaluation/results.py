@@ -4,7 +4,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
 from statistics import median, quantiles, stdev
@@ -98,6 +98,12 @@ class Report:
     def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
         """Measurements of every view."""
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
+
+    def once_more(self, recipe: str, name: str) -> "Report":
+        """The report with a recipe's rows again, under another name."""
+        again = tuple(replace(m, recipe=name) for m in self.measurements if m.recipe == recipe)
+        named = {key: {name: self.protocol[key][recipe]} for key in ("recipes", "recipes_sha256")}
+        return self.with_more(Report(again, named))
 
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""

@@ -64,7 +64,8 @@ def fit(
     job = TuningJob(start, original.training.cameras, truth, balance(replace(QUICK_SETTINGS, steps=steps), errors))
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
-    report = report_of(result)
+    closed_form = before.once_more(CLOSED_FORM, CONVERTED)
+    report = report_of(result) if steps else closed_form
     for part in PARTS_OF_CHANGE if state.step else ():
         if not _is_worse(report, CONVERTED):
             break
@@ -78,8 +79,7 @@ def fit(
         then = "keeping the closed form" if kept else "read the table before you use it"
         monitor.say(f"still worse than the original at some scale: {then}")
         if kept:
-            result = start.scene
-            report = report_of(result)
+            result, report = start.scene, closed_form
     return result, report
 
 

@@ -84,6 +84,8 @@ def check_side(where: str, width: int, height: int) -> None:
 
 def _check_colour(text: str, where: str) -> None:
     """Refuse what is no colour; the module that knows colours imports torch, so it waits for one to be given."""
+    if text == "transparent":
+        raise UsageError(where, "takes auto or an opaque colour; `transparent` is for images without one")
     if text != "auto":
         import_module("aaplug.io.images").colour_of(text, where)
 

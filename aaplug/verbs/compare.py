@@ -54,7 +54,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         AaplugError: as `render`; also, there are fewer than two scenes, or one is named twice.
     """
     folder, viewer = None if output is None else Path(output), find_viewer(options.viewer)
-    check = partial(check_compared, folder, options.resume, options.overwrite)
+    check = partial(check_compared, folder, options.resume, options.overwrite, options.show)
     check()
     metrics, say = find_metrics(options.metric, PROTOCOL), options.monitor.say
     named = _named(scenes)
@@ -104,9 +104,10 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     return comparison
 
 
-def check_compared(folder: Path | None, resume: bool, overwrite: bool) -> None:
+def check_compared(folder: Path | None, resume: bool, overwrite: bool, show: str) -> None:
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
-    check_journalled(folder, (*COMPARED, PAGE), "a comparison", resume, overwrite)
+    seen = show != CompareOptions.show
+    check_journalled(folder, (*COMPARED, PAGE), "a comparison", resume, overwrite, show=seen)
 
 
 def _named(scenes: ScenesLike) -> dict[str, Scene]:

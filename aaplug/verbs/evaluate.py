@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.engine import Task, candidates_of, facts_of
@@ -18,10 +18,10 @@ from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike
 from aaplug.io.scenes.scene import Scene
-from aaplug.options.verbs import EvaluateOptions, Layout
+from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import OutputError, UsageError, counted, not_one_of
+from aaplug.system.errors import OutputError, UsageError, counted
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
@@ -87,21 +87,22 @@ def check_results(
     folder: Path | None, resume: bool, overwrite: bool, report: bool = False, layout: str = "plain"
 ) -> None:
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
-    if layout not in get_args(Layout):
-        raise UsageError("layout", not_one_of(layout, get_args(Layout)))
-    for parameter, asked in {"report": report, "layout": layout != "plain"}.items():
-        if asked and folder is None:
-            raise UsageError(parameter, "needs a folder; give `output`")
-    check_journalled(folder, (*RESULTS, PAGE) if report else RESULTS, "an evaluation", resume, overwrite)
+    files = (*RESULTS, PAGE) if report else RESULTS
+    check_journalled(folder, files, "an evaluation", resume, overwrite, report=report, layout=layout != "plain")
 
 
-def check_journalled(folder: Path | None, files: Sequence[str], what: str, resume: bool, overwrite: bool) -> None:
-    """Refuse to resume without a folder, and to replace in it a journal of `what` or any of the files unasked."""
-    if resume and folder is None:
-        raise UsageError("resume", "needs a folder; give `output`")
+def check_journalled(
+    folder: Path | None, files: Sequence[str], what: str, resume: bool, overwrite: bool, **asked: bool
+) -> None:
+    """Refuse to replace in a folder a journal of `what` or any of the files unasked, and to do without one.
+
+    asked: whether other options ask for something in the folder.
+    """
     if resume and overwrite:
         raise UsageError("resume", "and `overwrite` contradict each other; give one")
     if folder is None:
+        for option in [name for name, is_asked in (*asked.items(), ("resume", resume)) if is_asked]:
+            raise UsageError(option, "needs a folder; give `output`")
         return
     if (folder / JOURNAL).exists() and not (overwrite or resume):
         raise OutputError(folder, f"holds {what}; `resume` continues it, `overwrite` starts anew")
