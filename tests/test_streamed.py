@@ -177,26 +177,28 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
         resumed.append(args[number_at])
         written(*args)
 
-    monkeypatch.setattr(f"aaplug.verbs.lod.{writer}", cut)
+    monkeypatch.setattr(f"aaplug.io.streamed.{writer}", cut)
     with pytest.raises(KeyboardInterrupt):
         made(tmp_path / "out", to, **tuned)
     assert not (tmp_path / "out" / streamed.STREAMS[to].index).exists()
-    monkeypatch.setattr(f"aaplug.verbs.lod.{writer}", recorded)
+    monkeypatch.setattr(f"aaplug.io.streamed.{writer}", recorded)
     monkeypatch.setattr(pyramid_folder.ply, "open_scene", lambda path, how: opened.add(path.name) or read(path, how))
     made(tmp_path / "out", to, resume=True, **tuned)
     assert resumed == [LEVELS]
     assert {f"scene_lod{level}.ply" for level in range(LEVELS)} - opened == {"scene_lod0.ply"}  # the scene itself
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    with pytest.raises(OutputError, match="out: is of a run that is complete: nothing is left to resume"):
+        made(tmp_path / "out", to, resume=True, **tuned)
 
 
 @pytest.mark.parametrize("to", streamed.STREAMS)
 def test_nothing_is_left_of_a_longer_run_that_was_cut_short(tmp_path, monkeypatch, to):
     written = streamed.write_index
-    monkeypatch.setattr("aaplug.verbs.lod.write_index", lambda folder, *rest: written(tmp_path / "elsewhere", *rest))
+    monkeypatch.setattr("aaplug.io.streamed.write_index", lambda folder, *rest: written(tmp_path / "elsewhere", *rest))
     with pytest.raises(FormatError, match="no such file"):
         made(tmp_path / "out", to)
     assert (tmp_path / "out" / "lod.json").exists()
-    monkeypatch.setattr("aaplug.verbs.lod.write_index", written)
+    monkeypatch.setattr("aaplug.io.streamed.write_index", written)
     made(tmp_path / "out", to, levels=LEVELS - 1, overwrite=True)
     names = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
     assert names == {streamed.SETTINGS, streamed.STREAMS[to].index}

@@ -39,7 +39,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
 from aaplug.verbs.refine_poses import refined
-from aaplug.verbs.verb import writes
+from aaplug.verbs.verb import IS_COMPLETE, writes
 
 Image = Float[Tensor, "h w 3"]
 
@@ -165,7 +165,7 @@ def _check(path: Path | None, inputs: Sequence[Path], resume: bool, replaces: bo
             raise UsageError("resume", "needs the `output` of the interrupted run")
         return
     if resume and not replaces and path.exists() and _beside(path, "json").exists():
-        raise OutputError(path, "is of a run that is complete: nothing is left to resume; `overwrite` starts anew")
+        raise OutputError(path, IS_COMPLETE)
     check_scene_output(path, replaces, inputs)
     for kind in ("json", "png", "pt"):
         check_output(_beside(path, kind), replaces, inputs)

@@ -21,40 +21,15 @@ from aaplug.core.sampling import check_frame, median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
+from aaplug.io import StreamName, streamed
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
-from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
+from aaplug.io.scenes import SceneLike, check_scene_output, pyramid_folder, write_scene, written_format
 from aaplug.io.scenes.columns import matrix_of
 from aaplug.io.scenes.ply import beside
-from aaplug.io.scenes.pyramid_folder import (
-    MANIFEST,
-    Level,
-    LevelFile,
-    Manifest,
-    hash_of,
-    is_pyramid,
-    levels_in,
-    read_manifest,
-    write_manifest,
-)
+from aaplug.io.scenes.pyramid_folder import MANIFEST, Level
 from aaplug.io.scenes.scene import FLOAT, Scene
-from aaplug.io.streamed import (
-    SETTINGS,
-    STREAMS,
-    Front,
-    facts_file,
-    front_folders,
-    leaves_of,
-    part_folders,
-    parts_of,
-    programs_of,
-    read_front,
-    remove_parts,
-    write_front,
-    write_index,
-    write_level,
-    write_page,
-)
+from aaplug.io.streamed import STREAMS, Front
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.conversion import fuse_for
@@ -67,7 +42,7 @@ from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
-from aaplug.verbs.verb import writes
+from aaplug.verbs.verb import IS_COMPLETE, writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
@@ -109,40 +84,19 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
         job.monitor.say(f"{whole.name}: merged Gaussians do not have its {lost}")
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
-        if not options.single:
-            earlier = set[Path]()  # folders of the streamed parts that are replaced
-            if path is not None and options.to is not None:
-                earlier = part_folders(path, options.to)
-                (path / STREAMS[options.to].index).unlink(missing_ok=True)
-            levels = []
-            for level in _levels(maker, path, files):
-                kept = level.scene
-                if path is not None and options.to is not None:
-                    kept = replace(kept, sh=kept.sh.new_full((1, 1, 1), torch.nan).expand(kept.sh.shape))
-                levels.append(level._replace(scene=kept))
-            if path is not None and options.to is not None:
-                rates = median_rates(whole.means, job.cameras.train)
-                compensated = maker.viewer is None or maker.viewer.convention_of(whole).compensated
-                rate = float(rates[rates > 0].median())
-                up = up_of(job.cameras).tolist()
-                frame = frame_of(job.scene.sample(PROBE_ROWS), up if any(up) else None)
-                settings = write_index(path, options.to, len(levels), rate, frame, compensated)
-                if options.page is not None:
-                    write_page(path, options.to, Path(options.page))
-                job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
-                remove_parts(earlier - part_folders(path, options.to), options.to)
-                if options.to == "rad":
-                    remove_parts(front_folders(path), "rad")
-                facts = [facts_file(path, number) for number in range(len(levels))]
-                stale += [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
-            for file in stale:
-                file.unlink(missing_ok=True)
-            return levels
-        lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
-        if path is not None:
-            how = (maker.viewer or MIP_VIEWER).spz(options.spz_axes)
-            write_scene(path, lighter.scene, overwrite=options.overwrite, **how)
-        return [lighter]
+        if options.single:
+            lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
+            if path is not None:
+                how = (maker.viewer or MIP_VIEWER).spz(options.spz_axes)
+                write_scene(path, lighter.scene, overwrite=options.overwrite, **how)
+            return [lighter]
+        if path is None or options.to is None:
+            levels = list(_levels(maker, path, files))
+        else:
+            levels = _streamed(maker, path, options.to, files)
+        for file in stale:
+            file.unlink(missing_ok=True)
+        return levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,41 +244,68 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     there: Iterator[Level] = iter(())
     pyramid = folder if options.viewer is None or options.to else None
     goals = goals_of(options, maker.scene)
-    manifest = Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
-    if pyramid and options.resume and is_pyramid(pyramid):
-        earlier = read_manifest(pyramid, unfinished=True)
+    manifest = pyramid_folder.Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
+    if pyramid and options.resume and pyramid_folder.is_pyramid(pyramid):
+        earlier = pyramid_folder.read_manifest(pyramid, unfinished=True)
         if earlier.source != manifest.source:
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
-        there = levels_in(pyramid, earlier, start=1)  # the first is the scene itself
+        there = pyramid_folder.levels_in(pyramid, earlier, start=1)  # the first is the scene itself
         manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
         maker.job.monitor.say(f"resumed with {counted(len(earlier.levels) - 1, 'level')}")
     made = Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
-    leaves, front = leaves_of(made), None
+    leaves, front = streamed.leaves_of(made), None
     for place in range(len(goals) + 1):
         if place:
             made = next(there, None) or maker(made, goals[place - 1])
         resumed, level, kept = place < len(manifest.levels), made, made
         if options.to == "rad":
             start = len(front.scene) if front else 0
-            front = read_front(folder, place) if resumed and folder else maker.above(front, made)
+            front = streamed.read_front(folder, place) if resumed and folder else maker.above(front, made)
             level = Level(front.scene[front.parents < 0], made.rate)
             if folder is not None and not resumed:
-                write_front(folder, place, front, start)
+                streamed.write_front(folder, place, front, start)
         elif options.to is None or not resumed:
             level = maker.finished(made)
             if options.to is None:
                 kept = level
             elif folder is not None:
-                write_level(folder, options.to, place, parts_of(level, leaves))
+                streamed.write_level(folder, options.to, place, streamed.parts_of(level, leaves))
         if folder is not None and not resumed:
             write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
                 assert made.chunks is not None
                 counts = torch.bincount(made.chunks, minlength=len(leaves)).tolist()
-                entry = LevelFile(files[place].name, level.rate, hash_of(files[place]), tuple(counts))
+                digest = pyramid_folder.hash_of(files[place])
+                entry = pyramid_folder.LevelFile(files[place].name, level.rate, digest, tuple(counts))
                 manifest = replace(manifest, levels=(*manifest.levels, entry))
-                write_manifest(pyramid, manifest)
+                pyramid_folder.write_manifest(pyramid, manifest)
         yield level
+
+
+def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]) -> list[Level]:
+    """The levels, streamed; what a run that is cut short resumes from is removed."""
+    options, cameras, earlier = maker.job.options, maker.job.cameras, streamed.part_folders(folder, to)
+    (folder / STREAMS[to].index).unlink(missing_ok=True)
+    levels = []
+    for level in _levels(maker, folder, files):
+        sh = level.scene.sh
+        scene = replace(level.scene, sh=sh.new_full((1, 1, 1), torch.nan).expand(sh.shape))
+        levels.append(level._replace(scene=scene))
+    rates = median_rates(maker.scene.means, cameras.train)
+    compensated = maker.viewer is None or maker.viewer.convention_of(maker.scene).compensated
+    up = up_of(cameras).tolist()
+    frame = frame_of(maker.job.scene.sample(PROBE_ROWS), up if any(up) else None)
+    rate = float(rates[rates > 0].median())
+    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated)
+    if options.page is not None:
+        streamed.write_page(folder, to, Path(options.page))
+    maker.job.monitor.say(f"set the viewer by {folder / streamed.SETTINGS}: {json.dumps(settings)}")
+    streamed.remove_parts(earlier - streamed.part_folders(folder, to), to)
+    if to == "rad":
+        streamed.remove_parts(streamed.front_folders(folder), to)
+    for file in [*files, folder / MANIFEST, *(streamed.facts_file(folder, place) for place in range(len(levels)))]:
+        file.unlink(missing_ok=True)
+    return levels
 
 
 def _source(maker: _Maker) -> str:
@@ -349,21 +330,23 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
     others = [output / MANIFEST] if options.viewer is None or options.to else []
     if options.to is not None:
+        if options.resume and not options.overwrite and (output / STREAMS[options.to].index).exists():
+            raise OutputError(output, IS_COMPLETE)
         refuse_existing([output / STREAMS[options.to].index], options.overwrite)
         for name, stream in STREAMS.items():
             if name != options.to and (output / stream.index).exists():
                 raise OutputError(output, f"holds levels for another viewer ({stream.index}); name another folder")
         if options.page is not None:
-            programs_of(options.to, Path(options.page))
+            streamed.programs_of(options.to, Path(options.page))
     refuse_existing([*files, *others], options.overwrite, options.resume)
     if not options.overwrite:
         return files, []
     stale = list(takewhile(Path.is_file, (output / f"{stem}_lod{level}.ply" for level in count(len(files)))))
-    if is_pyramid(output):
+    if pyramid_folder.is_pyramid(output):
         with suppress(FormatError):
-            stale += [output / level.file for level in read_manifest(output, unfinished=True).levels]
+            stale += [output / level.file for level in pyramid_folder.read_manifest(output, unfinished=True).levels]
         stale.append(output / MANIFEST)
-    stale += takewhile(Path.is_file, (facts_file(output, level) for level in count(len(files))))
+    stale += takewhile(Path.is_file, (streamed.facts_file(output, level) for level in count(len(files))))
     stale = [file for file in stale if file not in (*files, *others)]
     refuse_inputs(stale, scene.files)
     return files, stale

@@ -22,6 +22,7 @@ from aaplug.system.executors import given_threads, torch_threads
 P = ParamSpec("P")
 O_contra = TypeVar("O_contra", bound=Options, contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
+IS_COMPLETE = "is of a run that is complete: nothing is left to resume; `overwrite` starts anew"
 ScenesLike = Mapping[str, SceneLike] | Sequence[SceneLike]
 
 
