@@ -71,7 +71,7 @@ def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
             inputs = read_inputs(scene)
             return aaplug.evaluate(*inputs, output, **keywords | given)
 
-    with running(options, None, lambda: None, (), shared=first.output) as workers:
+    with running(options, shared=first.output) as workers:
         runs = [(name, partial(run, scene, workers.cluster)) for name, scene in scenes]
         how = {"resume": options.resume, "overwrite": options.overwrite, "monitor": TERMINAL}
         how |= {"protocol": words.protocol, "partly": words.skip} if of_set else {}

@@ -321,7 +321,7 @@ def test_views_measured_in_processes_are_the_same(cli, monkeypatch, tmp_path):
     given = {"a": scene, "b": replace(scene, convention=MIP)}
     how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
     expected = aaplug.compare(given, cameras, **how).report
-    monkeypatch.setattr("aaplug.verbs.compare.ProcessesIfLong", lambda threads: SimpleNamespace(map=sent))
+    monkeypatch.setattr("aaplug.rendering.job.ProcessesIfLong", lambda threads: SimpleNamespace(map=sent))
     found = aaplug.compare(given, cameras, **how).report
     assert [m.values for m in found.measurements] == [m.values for m in expected.measurements]
 

@@ -52,7 +52,10 @@ def filmed(
             problem = "is a share of the time between frames of a path; for one view give `camera_to`"
             raise UsageError("shutter", problem)
         motions = _motions([_instant(view) for view in views], shutter)
-    if motions and all(_still(*motion) for motion in motions):
+    if motions and all(
+        torch.allclose(first.cam_from_world, last.cam_from_world, 1e-9, 1e-12) and first.intrinsics == last.intrinsics
+        for first, last in motions
+    ):
         if camera_to or options.shutter is not None:
             raise UsageError(option, "finds no motion: the path has zero length")
         motions = ()  # the path's file has a shutter, and a camera that stands still
@@ -94,9 +97,3 @@ def _motions(frames: Sequence[Camera], shutter: float) -> list[tuple[Camera, Cam
     ends = toward(frames[0], frames[1], -1.0), toward(frames[-1], frames[-2], -1.0)
     around = zip([ends[0], *frames[:-1]], frames, [*frames[1:], ends[1]], strict=True)
     return [(toward(frame, before, shutter / 2), toward(frame, after, shutter / 2)) for before, frame, after in around]
-
-
-def _still(first: Camera, last: Camera) -> bool:
-    """Whether two cameras see the same."""
-    same = torch.allclose(first.cam_from_world, last.cam_from_world, 1e-9, 1e-12)
-    return same and first.intrinsics == last.intrinsics

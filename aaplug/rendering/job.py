@@ -37,7 +37,7 @@ from aaplug.rendering.assumed import cameras_around, decibels_at
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
-from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, given_threads, torch_threads
+from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, ProcessesIfLong, given_threads, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
 
@@ -204,8 +204,7 @@ class Job(Generic[O_co]):
         """
         cost = cost or cost_of(renderers, views)
         needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER_SECONDS else 1)
-        sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
-        what = f"{work or counted(len(views) * len(renderers), 'image')} at {sizes}"
+        what = f"{work or counted(len(views) * len(renderers), 'image')} at {sizes_of(views)}"
         if lacking := lack_of_memory(needed):
             raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
         if cost.seconds >= LONG_JOB or needed >= LARGE_JOB:
@@ -215,6 +214,11 @@ class Job(Generic[O_co]):
             self.monitor.say(f"{what}: {minutes}{memory}; fewer {fewer} take less")
 
 
+def sizes_of(views: Iterable[Camera]) -> str:
+    """The sizes of images, for a message."""
+    return listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
+
+
 @dataclass(frozen=True)
 class Workers:
     """Those who draw: torch's threads of this process, and the cluster if one is named."""
@@ -222,13 +226,18 @@ class Workers:
     threads: int
     cluster: Executor | None
 
+    @property
+    def pool(self) -> Executor:
+        """The cluster, or processes of this machine where views take long."""
+        return self.cluster or ProcessesIfLong(self.threads)
+
 
 @contextmanager
 def running(
     options: Options,
-    output: Path | None,
-    check: Callable[[], object],
-    inputs: Iterable[AnyPath],
+    output: Path | None = None,
+    check: Callable[[], object] = lambda: None,
+    inputs: Iterable[AnyPath] = (),
     folder: bool = False,
     shared: Path | None = None,
 ) -> Iterator[Workers]:

@@ -340,7 +340,7 @@ class Renderer:
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
         """Camera of the supersampled image, and the samples along a pixel's side."""
         samples = self.samples(camera)
-        return camera.resized(camera.width * samples, camera.height * samples), samples
+        return self._fine(camera, samples), samples
 
     def samples(self, camera: Camera) -> int:
         """Number of samples along a pixel's side."""

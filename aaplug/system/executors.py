@@ -118,9 +118,9 @@ class ProcessesIfLong:
 
     def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield `work(item)` of every item, in order; errors as those of `Processes`."""
-        first, *others = items
-        started = time.perf_counter()
-        yield work(first)
+        all_of, started = list(items), time.perf_counter()
+        yield from map(work, all_of[:1])
+        others = all_of[1:]
         left = (time.perf_counter() - started) * len(others)
         workers = min(self.workers, len(others)) if left > self.pays_after else 1
         yield from (map if workers < 2 else Processes(workers).map)(work, others)

@@ -44,7 +44,7 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
     if scene is not None and tuple(options.gaussians) != BenchOptions.gaussians:
         raise UsageError("gaussians", "are of synthetic scenes; leave them out, or the scene")
     runs: list[Figures] = []
-    with running(options, None, lambda: None, ()):
+    with running(options):
         if scene is None:
             work = _synthetic(options)
         else:

@@ -13,12 +13,11 @@ from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_fra
 from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import JOURNAL
-from aaplug.evaluation.metric import TimedRenderer
 from aaplug.evaluation.metrics import PSNR, find_metrics
-from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.report.contact_sheet import sheet_of
 from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import as_csv
-from aaplug.evaluation.truth import Truth, ViewTruth
+from aaplug.evaluation.truth import Truth
 from aaplug.io.atomic import AnyPath
 from aaplug.io.images import write_png
 from aaplug.io.scenes import scene_of
@@ -29,7 +28,6 @@ from aaplug.options.verbs import COMPARED_SCALES, CompareOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
-from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.evaluate import check_journalled
 from aaplug.verbs.verb import ScenesLike, compares
 from aaplug.verbs.views import file_names
@@ -86,9 +84,8 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         }
         if folder and options.overwrite:
             remove_run(folder)
-        pool = workers.cluster or ProcessesIfLong(workers.threads)
         with job.monitor.progress("comparing", "views") as tell:
-            report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, pool.map)
+            report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, workers.pool.map)
         comparison = Comparison(rows, report)
         if folder and images:
             bounds = task.coverage(job.scene.gaussians())
@@ -138,11 +135,5 @@ def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
     values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
     defined = [(value, view) for value, view in values if value is not None]
     worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
-    truth = ViewTruth(task.truth, task.views[worst])
-    others = {c.name: TimedRenderer(c.renderer) for c in task.candidates if c.name != reference}
-    rows = []
-    for scale in sorted(task.scales, reverse=True):
-        expected = truth.image(scale)
-        assert expected is not None
-        rows.append((scale, [expected, *(renderer(truth.camera(scale)).rgb for renderer in others.values())]))
-    return contact_sheet((reference, *others), rows, errors=True)
+    others = [candidate for candidate in task.candidates if candidate.name != reference]
+    return sheet_of(task.truth, task.views[worst], sorted(task.scales, reverse=True), others, reference, errors=True)

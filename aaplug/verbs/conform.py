@@ -76,10 +76,13 @@ def conform(
             made = [folder / f"{test.name}.png" for test in TESTS if program is not None]
             refuse_existing([*(path for paths in files.values() for path in paths), *made], overwrite)
             make_folder(folder)
+            rotation = CAMERA.cam_from_world[:3, :3].T.tolist()
+            place = {"position": CAMERA.centre.tolist(), "rotation": rotation, "fx": CAMERA.fx, "fy": CAMERA.fy}
+            entry = {"id": 0, "img_name": CAMERA.name, "width": SIDE, "height": SIDE, **place}  # as 3DGS writes it
             for test, (scene, camera) in files.items():
                 write_scene(scene, test.stored, overwrite=overwrite)
                 with replacing(camera, overwrite) as stream:
-                    stream.write(as_json([_entry()]).encode())
+                    stream.write(as_json([entry]).encode())
         pictures = dict[str, Float[Tensor, "h w 3"] | str]()
         if program is not None or images is not None:
             with monitor.progress("drawing", "pictures") as tell:
@@ -100,13 +103,6 @@ def conform(
                 write_png(expected, draw(test.scene, shown).float(), overwrite=overwrite)
             monitor.say(f"wrote {folder}: scenes, cameras, and in {EXPECTED} what {shown.name} draws")
         return verdict
-
-
-def _entry() -> dict[str, object]:
-    """The camera as 3DGS writes it."""
-    rotation = CAMERA.cam_from_world[:3, :3].T.tolist()
-    place = {"position": CAMERA.centre.tolist(), "rotation": rotation, "fx": CAMERA.fx, "fy": CAMERA.fy}
-    return {"id": 0, "img_name": CAMERA.name, "width": SIDE, "height": SIDE, **place}
 
 
 def _run(program: str | Callable[[Path, Path, Path], object], *paths: Path) -> str:

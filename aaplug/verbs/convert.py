@@ -97,7 +97,14 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
             _write_in_parts(job, rule, path, workers.threads, files)
             return Converted(job.scene.count, None, viewer)
-        fused, report = (_closed_form(job, rule), None) if isinstance(rule, Form) else _fitted(job, viewer)
+        if isinstance(rule, Form):
+            fused, report = _closed_form(job, rule), None
+        else:
+            gaussians = job.scene.gaussians()
+            steps = steps_for(gaussians, viewer) if options.steps is None else options.steps
+            look = job.look(steps, gradients=True)
+            job.say_assumed(look)
+            fused, report = fit(gaussians, viewer, look, job.views, steps, job.monitor)
         if path is not None:
             write_scene(path, fused, **files)
     return Converted(len(fused), fused, viewer, report)
@@ -186,12 +193,3 @@ def convert_parts(
         yield part
         done += len(part)
         tell(min(done, scene.count), scene.count)
-
-
-def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> tuple[Gaussians, Report]:
-    """The scene optimized for a viewer, and how close it came."""
-    gaussians = job.scene.gaussians()
-    steps = steps_for(gaussians, viewer) if job.options.steps is None else job.options.steps
-    look = job.look(steps, gradients=True)
-    job.say_assumed(look)
-    return fit(gaussians, viewer, look, job.views, steps, job.monitor)

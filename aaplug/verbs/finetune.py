@@ -1,7 +1,7 @@
 """Fine-tuning: a plain scene file that looks right at every scale by the rule that will show it."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,15 +9,13 @@ from statistics import mean
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Candidate, Task, evaluate
-from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.report.contact_sheet import sheet_of
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
@@ -40,8 +38,6 @@ from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import IS_COMPLETE, writes
-
-Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         if path is not None:
             with replacing(_beside(path, "json"), replaces) as stream:
                 stream.write(json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1).encode())
-            sheet = _sheet(candidates, job.views[0], scales, truth)
+            sheet = sheet_of(truth, job.views[0], scales, candidates, "truth")
             write_png(_beside(path, "png"), sheet, overwrite=replaces)
             _beside(path, "pt").unlink(missing_ok=True)
     return tuned
@@ -179,9 +175,3 @@ def _cost(start: Renderer, views: Sequence[Camera], settings: Settings) -> Cost:
     truths = min(settings.steps * (1 + anchors), len(views) * len(frame))
     seconds = GRADIENTS * settings.steps * step + truths * frame[1.0]
     return cost_of([start], views)._replace(seconds=seconds)
-
-
-def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float], truth: Truth) -> Image:
-    """A view at every scale: the truth, and each candidate."""
-    rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
-    return contact_sheet(("truth", *(c.name for c in candidates)), rows)

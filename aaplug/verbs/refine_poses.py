@@ -37,7 +37,7 @@ def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOpt
     if scene is None:
         raise UsageError("scene", "name one")
     job = Job.of(scene, cameras, options)
-    with running(options, None, lambda: None, job.inputs):
+    with running(options):
         return refined(job, job.look(len(job.views), gradients=True), job.views)
 
 

@@ -12,10 +12,9 @@ from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
-from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import counted, listing
-from aaplug.system.executors import ProcessesIfLong
+from aaplug.system.errors import counted
 from aaplug.verbs.verb import writes
 from aaplug.verbs.views import eyes_of, image_paths, names_image, seen, storage_of
 
@@ -48,10 +47,9 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     ends = select_views(job.cameras, options.camera_to, "camera_to") if options.camera_to else ()
     unsized = file.unsized if file else job.cameras.assumed
     views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
-    each_end = eyes_of(ends, options) if ends else [()] * len(eyes_of(views, options))
     eyes = [
         filmed(job.along(eye) if file else eye, options, file is not None, file and file.shutter, end)
-        for eye, end in zip(eyes_of(views, options), each_end, strict=True)
+        for eye, end in zip(eyes_of(views, options), eyes_of(ends, options), strict=True)
     ]
     views = [view for both in zip(*eyes, strict=True) for view in both]
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
@@ -62,9 +60,8 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
         job.announce([renderer], views, processes=workers.threads)
         job.say_assumed(renderer, views[0])
         with job.monitor.progress("rendering", "views") as tell:
-            pool = workers.cluster or ProcessesIfLong(workers.threads)
             how = {"storage": storage, "overwrite": options.overwrite, "tell": tell}
-            write_frames(renderer, views, paths, pool.map, **how)
+            write_frames(renderer, views, paths, workers.pool.map, **how)
     return [Written(*pair) for pair in zip(views, paths, strict=True)]
 
 
@@ -75,10 +72,9 @@ def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     grid = " or ".join(f"{n}×{n}" for n in samples)
     exposed = any(view.exposure for view in views)
     mean = f", mean of {' or '.join(map(str, counts))} frames" * exposed
-    sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
     return (
-        f"recipe: {renderer.recipe.name} for a {kind}, {counted(len(views), 'view')} at {sizes}, "
+        f"recipe: {renderer.recipe.name} for a {kind}, {counted(len(views), 'view')} at {sizes_of(views)}, "
         f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel{mean}"
     )

@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, ParamSpec, Protocol, TypeVar, get_type_hints
+from types import NoneType
+from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
 
 from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import SceneLike
@@ -64,21 +65,21 @@ def writes(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[SceneLike, CamerasLike, AnyPath | None, O_contra], R_co]], Writing[P, R_co]]:
     """Decorate a verb that works on a scene and can write an output."""
-    return _with(options, ("cameras", "output"))
+    return _with(options)
 
 
 def looks(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[SceneLike | None, CamerasLike, O_contra], R_co]], Looking[P, R_co]]:
     """Decorate a verb that looks at a scene."""
-    return _with(options, ("scene", "cameras"))
+    return _with(options)
 
 
 def compares(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[ScenesLike, CamerasLike, AnyPath | None, O_contra], R_co]], Comparing[P, R_co]]:
     """Decorate a verb that works on several scenes."""
-    return _with(options, ("cameras", "output"))
+    return _with(options)
 
 
 def check_name(output: Any) -> None:
@@ -92,12 +93,12 @@ def check_name(output: Any) -> None:
         raise OutputError(output, f"cannot be written: {reason(error)}") from error
 
 
-def _with(options: Any, optional: tuple[str, ...]) -> Any:
+def _with(options: Any) -> Any:
     def decorate(body: Callable[..., Any]) -> Callable[..., Any]:
         *given, last = inspect.signature(body).parameters.values()
         assert last.name == "options"
-        inputs = inspect.Signature([p.replace(default=None) if p.name in optional else p for p in given])
-
+        optional = (NoneType in get_args(p.annotation) for p in given)
+        inputs = inspect.Signature([p.replace(default=None) if o else p for p, o in zip(given, optional, strict=True)])
         body_checked = contract(body)
 
         @wraps(body)

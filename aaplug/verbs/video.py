@@ -25,10 +25,9 @@ from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
-from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import OutputError, UsageError, counted, listing
-from aaplug.system.executors import ProcessesIfLong
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.frame_sequences import FrameSequence
@@ -86,8 +85,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     path = file.cameras if file else _built_in_path(job, fps)
     views = seen(job, path, file.unsized if file else job.cameras.assumed)
     if len({view.hw for view in views}) > 1:
-        sizes = listing([f"{view.width}x{view.height}" for view in views], most=3)
-        raise UsageError("path", f"has frames of different sizes ({sizes} px); give `resolution`")
+        raise UsageError("path", f"has frames of different sizes ({sizes_of(views)} px); give `resolution`")
     eyes = [filmed(job.along(eye), options, True, file and file.shutter) for eye in eyes_of(views, options)]
     views = eyes[0]
     if sequence is not None:
@@ -115,7 +113,6 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         job.say_assumed(renderers[-1], views[0])
         panes, files = [(renderer, eye) for renderer in renderers for eye in eyes], list[list[Path]]()
         with job.monitor.progress("rendering", "images") as tell:
-            pool = workers.cluster or ProcessesIfLong(workers.threads)
 
             def tell_after(done: int) -> Tell:
                 return lambda now, _: tell(done + now, len(panes) * len(views))
@@ -123,15 +120,13 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
             if sequence is not None:
                 left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
                 paths, cameras_left = [sequence.paths[place] for place in left], [views[place] for place in left]
-                tell_all = tell_after(len(views) - len(left))
-                tell_all(0, len(left))
-                if left:
-                    write_frames(renderers[0], cameras_left, paths, pool.map, storage=storage, tell=tell_all)
+                tell_left = tell_after(len(views) - len(left))
+                write_frames(renderers[0], cameras_left, paths, workers.pool.map, storage=storage, tell=tell_left)
                 return Clip(sequence.pattern, len(views), fps)
             with scratch(str(target.parent) if workers.cluster else None) as kept:  # images until the video is written
                 for place, (renderer, eye) in enumerate(panes):
                     files.append([kept / f"{place}-{index:06d}.png" for index in range(len(views))])
-                    write_frames(renderer, eye, files[-1], pool.map, tell=tell_after(place * len(views)))
+                    write_frames(renderer, eye, files[-1], workers.pool.map, tell=tell_after(place * len(views)))
                 images = ([read_image(file, None) for file in each] for each in zip(*files, strict=True))
                 write_video(target, starmap(compose, enumerate(images)), fps, options.overwrite)
     return Clip(target, len(views), fps)

@@ -46,7 +46,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
         return subject_of(path, None, path.name, (path.name,))
 
     with ExitStack() as stack:
-        stack.enter_context(running(options, None, lambda: None, ()))
+        stack.enter_context(running(options))
         if scene is None:
             folder = stack.enter_context(as_file(files("aaplug.io.sample")))
             scene, cameras = folder / SAMPLE, folder if cameras is None else cameras

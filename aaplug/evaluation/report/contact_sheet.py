@@ -13,9 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.cameras import Camera
 from aaplug.core.imaging import levels, quantised
+from aaplug.evaluation.engine import Candidate
 from aaplug.evaluation.metrics import PSNR, psnr
 from aaplug.evaluation.results import scale_name
+from aaplug.evaluation.truth import Truth
 
 CELL_HEIGHT = 320  # px
 GAP = 12  # px
@@ -65,6 +68,15 @@ def contact_sheet(
             if caption:
                 _write(sheet, caption, left, top + row_height - GAP)
     return torch.from_numpy(sheet).float() / BYTE
+
+
+def sheet_of(
+    truth: Truth, view: Camera, scales: Sequence[float], candidates: Sequence[Candidate], of: str, errors: bool = False
+) -> Float[Tensor, "H W 3"]:
+    """A view at every scale: the truth `of` which the heading is, then each candidate; see `contact_sheet`."""
+    with torch.no_grad():
+        rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
+    return contact_sheet((of, *(candidate.name for candidate in candidates)), rows, errors)
 
 
 def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
