@@ -79,18 +79,17 @@ def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
     return Answer(batch.summary(), batch.tables(), bool(batch.failures))
 
 
-def for_each_scene(words: Words, suffix: Callable[[Words], str]) -> Answer:
+def for_each_scene(words: Words, suffix: Callable[[Words], str], is_made: Callable[[Words], bool]) -> Answer:
     """Do a verb for every scene of its batch file, and write batch.json.  One scene that fails stops no other.
 
-    suffix: of a scene's output.
+    suffix: of a scene's output.  is_made: whether a scene's output is there, and complete.
     """
     from aaplug.evaluation.report.files import as_json, write_texts
     from aaplug.io.atomic import refuse_existing
-    from aaplug.io.scenes.pyramid_folder import is_pyramid, read_manifest
+    from aaplug.io.scenes.pyramid_folder import is_pyramid
     from aaplug.options.shared import RecipeOptions
     from aaplug.rendering.job import running
     from aaplug.verbs.batch import SUMMARY, status_table
-    from aaplug.verbs.lod import DEFAULT_LEVELS
     from aaplug.verbs.views import file_names
 
     scenes = dict(scenes_of(words.batch, words.where(batch=None, resume=False, scheduler=None)))
@@ -98,11 +97,11 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str]) -> Answer:
     done, todo = dict[str, dict[str, Any]](), dict[str, Words]()
     for slug, (name, scene) in zip(file_names(list(scenes), "scene", 3), scenes.items(), strict=True):
         output = folder / (slug + suffix(scene))
-        levels = len(read_manifest(output, unfinished=True).levels) if words.resume and is_pyramid(output) else 0
-        if words.resume and (output.is_file() or levels > (scene.values.get("levels") or DEFAULT_LEVELS)):
+        scene = scene.where(output=output, resume=words.resume and is_pyramid(output))
+        if words.resume and is_made(scene):
             done[name] = {"status": "kept", "output": str(output)}
         else:
-            todo[name] = scene.where(output=output, resume=levels > 0)
+            todo[name] = scene
     check = partial(refuse_existing, [folder / SUMMARY], words.overwrite or words.resume)
     check()
     options = RecipeOptions(scheduler=words.scheduler, threads=words.threads, monitor=TERMINAL)

@@ -86,7 +86,7 @@ def convert(words: Words) -> Answer:
     Gaussians, use lod; to move the Gaussians until all sizes look right, finetune.
     """
     if words.batch is not None:
-        return for_each_scene(words, lambda scene: ".ply")
+        return for_each_scene(words, lambda scene: ".ply", lambda scene: scene.output.is_file())
     if words.resume:
         raise UsageError("resume", "belongs to --batch")
     inputs = read_inputs(words)
@@ -117,7 +117,13 @@ def lod(words: Words) -> Answer:
     Levels make small images faster and cleaner.  To keep every Gaussian, use convert or finetune.
     """
     if words.batch is not None:
-        return for_each_scene(words, lambda scene: ".ply" if scene.of(verbs.LodOptions).single else "")
+        from aaplug.verbs.lod import is_made
+
+        return for_each_scene(
+            words,
+            lambda scene: ".ply" if scene.of(verbs.LodOptions).single else "",
+            lambda scene: is_made(scene.output, scene.of(verbs.LodOptions)),
+        )
     scene, cameras = read_inputs(words)
     levels = aaplug.lod(scene, cameras, words.output, **told(words, verbs.LodOptions))
     *finer, last = (len(level.scene) for level in levels)

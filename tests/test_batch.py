@@ -305,6 +305,7 @@ cameras = "."
     [
         ("convert", "variance = 0.1", ("scene.ply", "wide.ply")),
         ("lod --no-refine", "levels = 1\nrefine = true\nsteps = 0", ("scene", "wide")),
+        ("lod --no-refine --to 3dtiles", "levels = 1", ("scene", "wide")),
     ],
 )
 def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, outputs):

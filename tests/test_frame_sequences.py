@@ -106,7 +106,7 @@ def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
     Path("path.json").touch()
     cli.refused(
         f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json",
-        "--path: has frames of different sizes (20x15, 15x20 px)",
+        "--path: has frames of different sizes (15x20, 20x15 px)",
     )
     assert not Path("out").exists()
 

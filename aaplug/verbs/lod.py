@@ -317,6 +317,16 @@ def _source(maker: _Maker) -> str:
     return digest_of_values((MERGING_RULE, *facts, *choices, *streamed))
 
 
+def is_made(output: Path, options: LodOptions) -> bool:
+    """Whether all that the options ask for is in the output."""
+    if options.single:
+        return output.is_file()
+    if options.to is not None:
+        return (output / STREAMS[options.to].index).exists()
+    made = pyramid_folder.is_pyramid(output) and pyramid_folder.read_manifest(output, unfinished=True).levels
+    return bool(made) and len(made) > (options.levels or DEFAULT_LEVELS)
+
+
 def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[list[Path], list[Path]]:
     """The files to write and an earlier run's to remove, checked before any work."""
     if output is None:
@@ -330,7 +340,7 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
     others = [output / MANIFEST] if options.viewer is None or options.to else []
     if options.to is not None:
-        if options.resume and not options.overwrite and (output / STREAMS[options.to].index).exists():
+        if options.resume and not options.overwrite and is_made(output, options):
             raise OutputError(output, IS_COMPLETE)
         refuse_existing([output / STREAMS[options.to].index], options.overwrite)
         for name, stream in STREAMS.items():
