@@ -25,7 +25,6 @@ BATCH = Option(
     "batch",
     flag("FILE.toml", read=Path),
     "Scenes and their settings from a file, and a folder for all as --output; what it does not say is as given here.",
-    None,
 )
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
     BATCH,
@@ -34,8 +33,7 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
         "scheduler",
         flag("local|tcp://HOST:PORT"),
         "With --batch: a scene at a time on each worker of a Dask cluster; see `aaplug guide cluster`.",
-        None,
-        DRAWING,
+        group=DRAWING,
     ),
 )
 

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import MISSING, asdict
 from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,7 +166,6 @@ def finetune(words: Words) -> Answer:
         "models",
         flag("FOLDER", read=Path),
         "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
-        None,
     ),
     Option("skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False),
     CameraOptions,
@@ -222,7 +221,7 @@ def video(words: Words) -> Answer:
         "Two or more scenes of any format, or their folders; the first is what the others are held to.",
         (),
     ),
-    Option("reference", flag("SCENE", read=Path), "The scene that the others are held to, instead of the first.", None),
+    Option("reference", flag("SCENE", read=Path), "The scene that the others are held to, instead of the first."),
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
@@ -230,8 +229,7 @@ def video(words: Words) -> Answer:
         "fail_under",
         number(0, 200, unit="dB"),
         "Exit with 1 if the mean PSNR of a scene but the first is below so many dB at any scale: --fail-under 40dB.",
-        None,
-        REPORT,
+        group=REPORT,
     ),
     FileOptions,
     Orbit,
@@ -387,7 +385,6 @@ def view(words: Words) -> Answer:
         flag("FOLDER", read=Path),
         "Compile into a folder, for other machines with the same torch: for x86-64-v3 and x86-64-v4."
         " Where AAPLUG_KERNELS names the folder, no compiler is needed.",
-        None,
     ),
     json_of("where the kernels are as one JSON object"),
 )
@@ -402,7 +399,7 @@ def warmup(words: Words) -> Answer:
 
 
 @verb(
-    Option("module", flag("MODULE", by_place=True), "The package, or one of its modules."),
+    Option("module", flag("MODULE", by_place=True), "The package, or one of its modules.", MISSING),
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> Answer:
@@ -422,9 +419,8 @@ def check_plugin(words: Words) -> Answer:
         flag("[PROGRAM]", by_place=True),
         "A command line in quotes, in which {scene}, {camera} and {image} stand for the .ply, the camera's .json and"
         " the .png to write; without them, the three are added at the end.",
-        None,
     ),
-    Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png.", None),
+    Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png."),
     output(
         "FOLDER", "Folder for scenes, cameras and pictures; without PROGRAM and --images they are written alone.", None
     ),
@@ -520,7 +516,7 @@ def recipes(words: Words) -> Answer:
     return Answer(facts, [table(rows[0], headings), "For comparison:", table(rows[1], headings)])
 
 
-@verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))
+@verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print."))
 def guide(words: Words) -> Answer:
     """List the guides, or print one.
 

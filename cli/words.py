@@ -27,12 +27,12 @@ T = TypeVar("T", bound=Options)
 
 
 class Option(NamedTuple):
-    """One option of a verb.  argument: how its value is read; None for a switch."""
+    """One option of a verb.  argument: how its value is read; None for a switch.  default: MISSING if it is needed."""
 
     name: str
     argument: Argument | None
     help: str
-    default: Any = MISSING
+    default: Any = None
     group: Group | None = None
 
     @property

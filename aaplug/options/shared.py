@@ -39,10 +39,7 @@ THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothin
 VIEWS = flag("NAME,...|test|train|all")
 RECIPE_NAMES = names_of("recipe", comparisons=False)
 RECIPE_METAVAR = "|".join([*RECIPE_NAMES, "..."])  # in `--help`
-RASTERIZER_NAMES = ("auto", "compiled")  # beside those of the registry
-LENS_NAMES = ("pinhole", "fisheye", "equisolid", "equirect", "vr180", "ortho")
 HALF_TURN = 180.0  # degrees: what a fisheye shows, unless another angle is given
-RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
 MAX_COORDINATE = 1e7  # world units
 DEFAULT_FOV = 50.0  # degrees
@@ -108,7 +105,7 @@ class ViewOptions(FrameOptions):
     """Colour behind the scene as CSS writes it, such as white or "#ff8000"; auto is what training had."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
-    rasterizer: Annotated[str | Rasterizer, names(*RASTERIZER_NAMES, kind="rasterizer"), DRAWING] = "auto"
+    rasterizer: Annotated[str | Rasterizer, names("auto", "compiled", kind="rasterizer"), DRAWING] = "auto"
     """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
     memory: Annotated[float | None, number(0.01, 1024, metavar="GB"), DRAWING] = None
     """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
@@ -126,7 +123,7 @@ class RecipeOptions(ViewOptions):
 
     quality: Annotated[str, names(*QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
-    rate_reference: Annotated[str | None, names(*RATE_REFERENCES), DRAWING] = None
+    rate_reference: Annotated[str | None, names(*get_args(RateReference)), DRAWING] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
     order: Annotated[SplatOrder, DRAWING] = "depth"
     """Order of splats: depth, of their centres, or tile, their depth along the ray of each tile: colours pop less."""
@@ -209,7 +206,7 @@ class FilmOptions(RecipeOptions):
 class LensOptions(Options):
     """The lens."""
 
-    lens: Annotated[str | None, names(*LENS_NAMES), LENS] = None
+    lens: Annotated[str | None, names("pinhole", "fisheye", "equisolid", "equirect", "vr180", "ortho"), LENS] = None
     """Draw through another lens (default: that of the camera); equirect is 360x180 degrees, vr180 a pair of eyes."""
     lens_angle: Annotated[float, number(1, 360, metavar="DEGREES"), LENS] = HALF_TURN
     """Angle that fisheye and equisolid show along the image's shorter side."""

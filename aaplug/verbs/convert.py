@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +87,13 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     if frames is not None and (path is None or written_format(path)):
         raise UsageError("output", "of frames is a folder: name one")
     outputs = [path / file.name for file in frames.paths] if path and frames else []
-    check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
-    check = partial(refuse_existing, outputs, options.overwrite) if outputs else check
+
+    def check() -> None:
+        if outputs:
+            refuse_existing(outputs, options.overwrite)
+        elif path is not None:
+            check_scene_output(path, options.overwrite, job.scene.files)
+
     check()
     with running(options, path, check, job.inputs, folder=frames is not None) as workers:
         if frames is not None and isinstance(rule, Form):
