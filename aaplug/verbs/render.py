@@ -8,15 +8,15 @@ from typing import NamedTuple
 from aaplug.core.cameras import Camera
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path, select_views
+from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import RenderOptions
-from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import counted
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import eyes_of, image_paths, names_image, seen, storage_of
+from aaplug.verbs.views import drawn, image_paths, names_image, storage_of
 
 
 class Written(NamedTuple):
@@ -43,15 +43,10 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     target = Path("images" if output is None else output)
     storage, options = storage_of(target, options)
     job = Job.of(scene, cameras, options, single=names_image(target))
-    file = None if options.path is None else read_camera_path(options.path)
+    path = None if options.path is None else read_camera_path(options.path)
     ends = select_views(job.cameras, options.camera_to, "camera_to") if options.camera_to else ()
-    unsized = file.unsized if file else job.cameras.assumed
-    views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
-    eyes = [
-        filmed(job.along(eye) if file else eye, options, file is not None, file and file.shutter, end)
-        for eye, end in zip(eyes_of(views, options), eyes_of(ends, options), strict=True)
-    ]
-    views = [view for both in zip(*eyes, strict=True) for view in both]
+    shown = path or CameraPath(job.views, unsized=job.cameras.assumed)
+    views = [view for eyes in zip(*drawn(job, shown, path is not None, ends), strict=True) for view in eyes]
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:

@@ -18,12 +18,12 @@ from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
+from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
-from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
@@ -32,7 +32,7 @@ from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import eyes_of, seen, storage_of
+from aaplug.verbs.views import drawn, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px
@@ -82,12 +82,11 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     job = Job.of(scene, cameras, options)
     beside = "none" if alone or options.beside is None else options.beside
     recipes = job.named(*(name for name in (beside, options.recipe) if name != "none"))
-    path = file.cameras if file else _built_in_path(job, fps)
-    views = seen(job, path, file.unsized if file else job.cameras.assumed)
+    path = file or CameraPath(tuple(_built_in_path(job, fps)), unsized=job.cameras.assumed)
+    eyes = drawn(job, path, True)
+    views = eyes[0]
     if len({view.hw for view in views}) > 1:
         raise UsageError("path", f"has frames of different sizes ({sizes_of(views)} px); give `resolution`")
-    eyes = [filmed(job.along(eye), options, True, file and file.shutter) for eye in eyes_of(views, options)]
-    views = eyes[0]
     if sequence is not None:
         sequence = replace(sequence, count=len(views))
         check = partial(sequence.check, options.overwrite, options.resume)
@@ -100,7 +99,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
             return torch.cat([*images], dim=1)
         receding = str(options.path) in RECEDING_PATHS
         rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
-        return side_by_side(images, labels, rate, min(views[index].hw) / min(path[index].hw))
+        return side_by_side(images, labels, rate, min(views[index].hw) / min(path.cameras[index].hw))
 
     path_file = [] if file is None else [str(options.path)]
     place = target if sequence is None else sequence.folder

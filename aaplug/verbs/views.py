@@ -12,9 +12,11 @@ from aaplug.core.colours import BLACK
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.atomic import check_output, refuse_existing
+from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage
-from aaplug.options.shared import LensOptions, check_side, size_of
+from aaplug.options.shared import check_side, size_of
 from aaplug.options.verbs import RenderOptions, VideoOptions
+from aaplug.rendering.film import filmed
 from aaplug.rendering.job import Job
 from aaplug.system.errors import OutputError, UsageError, counted
 
@@ -25,8 +27,19 @@ STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
 
 
-def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
-    """The views through the lens and at the size that a job's options ask for.
+def drawn(job: Job[Drawn], path: CameraPath, moves: bool, ends: Sequence[Camera] = ()) -> list[list[Camera]]:
+    """The cameras of each eye: two for vr180, else one; with the lens, size and exposure that a job's options ask for.
+
+    moves: the cameras are frames of one motion.  ends: where the shutter closes, see `filmed`.
+    """
+    options, count = job.options, 2 if job.options.lens == "vr180" else 1
+    views, ends = (_seen(job, each, path.unsized) for each in (path.cameras, ends))
+    eyes = [(views[eye::count], ends[eye::count]) for eye in range(count)]
+    return [filmed(job.along(v) if moves else v, options, moves, path.shutter, end) for v, end in eyes]
+
+
+def _seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
+    """The views through the lens and at the size that a job's options ask for; with vr180 of both eyes in turn.
 
     unsized: pixels stay square where a resolution changes the aspect, as they do through a lens that shows its angle
         along the shorter side.
@@ -49,11 +62,6 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
     for view in sized:
         check_side(view.name, view.width, view.height)
     return sized
-
-
-def eyes_of(views: Sequence[Camera], options: LensOptions) -> list[Sequence[Camera]]:
-    """The views of each eye, all as `seen` gives them: two lists for vr180, else one."""
-    return [views[::2], views[1::2]] if options.lens == "vr180" else [views]
 
 
 def _through_lens(job: Job[Drawn], view: Camera) -> list[Camera]:
