@@ -12,7 +12,7 @@ from aaplug.options.shared import SCALE, Orbit
 from aaplug.system.errors import UsageError, counted
 
 from .console import TERMINAL, say
-from .words import Words, options_of, worded
+from .words import Words
 
 if TYPE_CHECKING:
     from aaplug.io.scenes.scene import Scene
@@ -87,7 +87,7 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
     for note in scene.notes:
         undecided = scene.other is not None and note == scene.notes[-1]
         text = f"unless the cameras tell otherwise, {note}" if undecided else note
-        say(worded(f"scene: {text}", options_of(FileOptions)))
+        say(words.command.worded(f"scene: {text}"))
     for fusion in scene.fused:
         say(f"fused: {describe(fusion)}")
     return scene
@@ -108,7 +108,7 @@ def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
         return orbit
     cameras = aaplug.read_cameras(path, **how)
     for note in cameras.notes:
-        say(worded(f"cameras: {note}", options_of(CameraOptions)))
+        say(words.command.worded(f"cameras: {note}"))
     return cameras
 
 

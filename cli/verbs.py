@@ -26,7 +26,7 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import VERBS, Answer, Command, Option, Words, json_of, options_of, output, worded
+from .words import VERBS, Answer, Command, Option, Words, json_of, output
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted(HERE.glob("../examples/guides/*.md"))}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
-NOTED: dict[str, type[Options]] = {"notes": FileOptions, "cameras": CameraOptions}  # of `info`, which name parameters
+NOTED = ("notes", "cameras")  # of `info`, which name parameters
 WRITTEN = (
     "File to write: .ply; .compressed.ply, .sog, .spz, .glb, .gltf, .usda, .usdc, .usdz or .splat, which keep less "
     "(see `aaplug guide formats`)"
@@ -298,8 +298,7 @@ def info(words: Words) -> Answer:
     facts = aaplug.info(*inputs, **told(words, FrameOptions))
     shown = {key: value for key, value in facts.items() if key not in PROGRAM_KEYS and value != []}
     names = [key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ") for key in shown]
-    options = {key: options_of(NOTED[key]) for key in shown if key in NOTED}
-    texts = [worded(_text(value), options.get(key, ())) for key, value in shown.items()]
+    texts = [words.command.worded(_text(value)) if key in NOTED else _text(value) for key, value in shown.items()]
     return Answer(facts, [table(zip(names, texts, strict=True))])
 
 

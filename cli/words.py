@@ -6,7 +6,7 @@ the heading under which it stands.
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
@@ -251,10 +251,14 @@ class Command:
             with within_memory(what):
                 yield
         except AaplugError as error:
-            options, where = self.options.values(), error.where
-            if isinstance(error, UsageError):
-                where = worded(f"`{where}`", options).strip("`")
-            raise type(error)(where, worded(error.problem, options)) from error
+            where = self.worded(f"`{error.where}`").strip("`") if isinstance(error, UsageError) else error.where
+            raise type(error)(where, self.worded(error.problem)) from error
+
+    def worded(self, text: str) -> str:
+        """The library's text with parameters as options: min_seen or `min_seen` becomes --min-seen."""
+        shown = {option.name: option.shown for option in self.options.values()}
+        names = r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b"
+        return re.sub(names, lambda match: shown.get(match[1] or match[2], match[0]), text)
 
     def refusal(self, problem: str) -> UsageError:
         """The error of words that are no command line of this verb."""
@@ -262,12 +266,6 @@ class Command:
 
 
 VERBS: dict[str, Command] = {}  # by name; `verbs` fills it
-
-
-def worded(text: str, options: Iterable[Option]) -> str:
-    """The library's text with parameters as options: min_seen or `min_seen` becomes --min-seen."""
-    shown = {option.name: option.shown for option in options}
-    return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", lambda match: shown.get(match[1] or match[2], match[0]), text)
 
 
 def _words_of(run: Callable[[Words], Answer], values: Mapping[str, Any]) -> Words:
