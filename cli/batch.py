@@ -140,7 +140,6 @@ def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:
 
 
 def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refused: Sequence[str]) -> Words:
-    """The options with a table's settings."""
     options = words.command.options
     names = [name for name in options if name not in refused]
     values = {}

@@ -141,6 +141,16 @@ def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ())
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
+def check_name(path: AnyPath) -> None:
+    """Refuse an output whose name the file system does not take."""
+    try:
+        Path(path).lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError) as error:
+        raise OutputError(path, f"cannot be written: {reason(error)}") from error
+
+
 def make_folder(path: AnyPath) -> Path:
     """Make a folder and its parents where they do not exist, and return it."""
     try:
@@ -171,6 +181,7 @@ def refuse_existing(paths: Sequence[Path], overwrite: bool, resume: bool | None 
     resume: whether the run that wrote them goes on; None where no run can.
     """
     folder = paths[0].parent
+    check_name(folder)
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file; name a folder")
     refuse_inputs(paths)

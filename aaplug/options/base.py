@@ -213,7 +213,6 @@ def docs_of(options: type) -> dict[str, str]:
 
 @cache
 def _checks(options: type[Options]) -> Sequence[tuple[str, Argument | None]]:
-    """Name and argument of each option."""
     return [(name, argument_of(hint)) for name, hint in get_type_hints(options, include_extras=True).items()]
 
 

@@ -110,7 +110,6 @@ class Cluster:
             raise ClusterError(f"scheduler {self.name}", f"has had no workers for {ABSENT_SECONDS:.0f} s")
 
     def _lost(self) -> ClusterError:
-        """The error of a scheduler that has gone."""
         again = "start it again, and repeat the command, with `resume` where it has one"
         return ClusterError(f"scheduler {self.name}", f"the connection is lost; {again}")
 

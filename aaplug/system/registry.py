@@ -209,7 +209,6 @@ def _at(place: str) -> Any:
 
 @cache
 def _points_of(kind: str) -> tuple[EntryPoint, ...]:
-    """Entry points of a kind."""
     return tuple(_points().select(group=group_of(kind)))
 
 

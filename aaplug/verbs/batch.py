@@ -24,7 +24,6 @@ from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, ClusterError, counted, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
-from aaplug.verbs.verb import check_name
 from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS, TABLE = "batch.json", "results.csv", "table.tex"
@@ -141,7 +140,6 @@ def batch(
     Raises:
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
-    check_name(output)
     found = None
     if protocol is not None:
         data_set_of(protocol)  # refuses what has none

@@ -22,7 +22,6 @@ from aaplug.system.contracts import contract
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, UsageError, reason
 from aaplug.system.executors import torch_threads
 from aaplug.system.monitor import SILENT, Monitor
-from aaplug.verbs.verb import check_name
 
 PLACEHOLDERS = ("{scene}", "{camera}", "{image}")
 PROGRAM_SECONDS = 300.0  # that a program may take for a picture
@@ -58,7 +57,6 @@ def conform(
             program that cannot be started.
         OutputError: a file exists and `overwrite` is false, or cannot be written.
     """
-    check_name(output)
     found = find_viewer(viewer)
     if program is not None and images is not None:
         raise UsageError("images", "and `program` both give the pictures; give one")

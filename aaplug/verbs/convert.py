@@ -115,7 +115,6 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
 
 
 def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
-    """The closed form for the Mip rule."""
     gaussians = job.scene.gaussians()
     training = None
     if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused

@@ -24,7 +24,6 @@ from aaplug.system.contracts import contract
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate
-from aaplug.verbs.verb import check_name
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 SHEET_VIEW = "r_136"
@@ -39,7 +38,6 @@ def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Moni
     Raises:
         OutputError: in the folder `output` a file exists and `overwrite` is false, or cannot be written.
     """
-    check_name(output)
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
     with output_folder(folder), as_file(files("aaplug.io.sample")) as sample:

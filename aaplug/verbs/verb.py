@@ -8,16 +8,14 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from os import PathLike
-from pathlib import Path
 from types import NoneType
 from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
 
-from aaplug.io.atomic import AnyPath
+from aaplug.io.atomic import AnyPath, check_name
 from aaplug.io.scenes import SceneLike
 from aaplug.options.base import Options, documented
 from aaplug.rendering.job import CamerasLike
 from aaplug.system.contracts import contract
-from aaplug.system.errors import OutputError, reason
 from aaplug.system.executors import given_threads, torch_threads
 
 P = ParamSpec("P")
@@ -82,17 +80,6 @@ def compares(
     return _with(options)
 
 
-def check_name(output: Any) -> None:
-    """Refuse an output whose name the file system does not take."""
-    try:
-        if isinstance(output, str | PathLike):
-            Path(output).lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except (OSError, ValueError) as error:
-        raise OutputError(output, f"cannot be written: {reason(error)}") from error
-
-
 def _with(options: Any) -> Any:
     def decorate(body: Callable[..., Any]) -> Callable[..., Any]:
         *given, last = inspect.signature(body).parameters.values()
@@ -106,7 +93,8 @@ def _with(options: Any) -> Any:
             own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
             bound = inputs.bind(*args, **own)
             bound.apply_defaults()
-            check_name(bound.arguments.get("output"))
+            if isinstance(output := bound.arguments.get("output"), str | PathLike):
+                check_name(output)
             with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
                 return body_checked(*bound.args, options.of(keywords))
 
