@@ -3,19 +3,18 @@
 import ast
 import inspect
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from aaplug.system.contracts import check_fields
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
 
-Chosen = TypeVar("Chosen", bound="Options")
 Bound = int | float
 PYTHON_ONLY = "python only"  # marks an option that the command line does not offer
 
@@ -182,14 +181,6 @@ class Options:
             if argument is not None:
                 argument.check(name, value)
         check_fields(self)
-
-    @classmethod
-    def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
-        """The options that a caller gave, checked by name, and the defaults."""
-        names = [field.name for field in fields(cls)]
-        for name in given.keys() - names:
-            raise UsageError(name, f"is no option here{did_you_mean(name, names)}")
-        return cls(**given)
 
 
 def argument_of(annotation: Any) -> Argument | None:

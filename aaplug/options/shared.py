@@ -4,10 +4,10 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
@@ -45,7 +45,6 @@ MAX_COORDINATE = 1e7  # world units
 DEFAULT_FOV = 50.0  # degrees
 DEFAULT_SENSOR = 0.036  # scene units: 36 mm, the width of full frame, where a scene unit is a metre
 
-V = TypeVar("V", bound="ViewOptions")
 _PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
 
 OneRecipe = Annotated[str | Recipe, names(kind="recipe", metavar=RECIPE_METAVAR)]
@@ -111,10 +110,6 @@ class ViewOptions(FrameOptions):
     """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
     cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), CAMERAS] = math.inf
     """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
-
-    def on(self: V, background: Background | None) -> V:
-        """These options, with a background where they leave it open."""
-        return self if background is None or self.background != "auto" else replace(self, background=background)
 
 
 @dataclass(frozen=True, kw_only=True)

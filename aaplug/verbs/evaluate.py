@@ -44,7 +44,9 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     protocol = options.protocol
     protocol = PROTOCOLS.find(protocol, "protocol") if isinstance(protocol, str) else protocol
     metrics = find_metrics(options.metric, protocol, options.lpips)
-    job = Job.of(scene, cameras, options.on(protocol.background))
+    if protocol.background is not None and options.background == "auto":
+        options = replace(options, background=protocol.background)
+    job = Job.of(scene, cameras, options)
     name = options.name or Path(job.scene.title).stem
     recipes, views, scales = job.recipes(options.recipe), job.views, options.scale or protocol.scales
     truth = protocol.truth or "auto" if options.truth == "auto" else options.truth

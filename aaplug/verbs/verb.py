@@ -16,6 +16,7 @@ from aaplug.io.scenes import SceneLike
 from aaplug.options.base import Options, documented
 from aaplug.rendering.job import CamerasLike
 from aaplug.system.contracts import contract
+from aaplug.system.errors import UsageError, did_you_mean
 from aaplug.system.executors import given_threads, torch_threads
 
 P = ParamSpec("P")
@@ -96,7 +97,9 @@ def _with(options: Any) -> Any:
             if isinstance(output := bound.arguments.get("output"), str | PathLike):
                 check_name(output)
             with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
-                return body_checked(*bound.args, options.of(keywords))
+                for name in keywords.keys() - hints:
+                    raise UsageError(name, f"is no option here{did_you_mean(name, hints)}")
+                return body_checked(*bound.args, options(**keywords))
 
         hints = get_type_hints(options)  # without what the command line adds to them
         fields = [p.replace(annotation=hints[name]) for name, p in inspect.signature(options).parameters.items()]

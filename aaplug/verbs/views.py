@@ -112,7 +112,7 @@ def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
         return storage, options
     if options.background != "auto":
         raise UsageError("background", "is not stored where alpha is; leave one of them out")
-    return storage, options.on(BLACK)
+    return storage, replace(options, background=BLACK)
 
 
 def names_image(output: Path) -> bool:
