@@ -9,8 +9,6 @@ from itertools import count, takewhile
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from aaplug.core.camera_paths import up_of
 from aaplug.core.cameras import Camera, digest_of_cameras
@@ -141,7 +139,12 @@ class _Maker:
             if scene is self.scene:
                 raise
             return unchanged  # no camera sees any of what is left
-        visible = self._visible(before, goal)
+        visible = None
+        if self.look is not None and not self.job.cameras.assumed:
+            look = self.look if scene is self.scene else self.look.showing(replace(scene, flat=False))
+            scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
+            with monitor.progress("looking", "views") as tell:
+                visible = visibility(look, self.views, scale, tell)
         with monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
                 level = Level(merge(scene, rates, goal, tell, visible), goal.rate)
@@ -201,15 +204,6 @@ class _Maker:
         how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller, beside)
         scene = refine(level.scene, level.rate, look, *how)
         return level._replace(scene=scene)
-
-    def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
-        """Visibility of each Gaussian; None where nobody knows the cameras."""
-        if self.look is None or self.job.cameras.assumed:
-            return None
-        look = self.look if before.scene is self.scene else self.look.showing(replace(before.scene, flat=False))
-        scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
-        with self.job.monitor.progress("looking", "views") as tell:
-            return visibility(look, self.views, scale, tell)
 
 
 def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:

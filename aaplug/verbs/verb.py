@@ -6,7 +6,7 @@ keywords of the verb, and so do `help` and the API's pages.
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import partial, wraps
 from os import PathLike
 from types import NoneType
 from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
@@ -64,48 +64,45 @@ def writes(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[SceneLike, CamerasLike, AnyPath | None, O_contra], R_co]], Writing[P, R_co]]:
     """Decorate a verb that works on a scene and can write an output."""
-    return _with(options)
+    return partial(_verb, options)
 
 
 def looks(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[SceneLike | None, CamerasLike, O_contra], R_co]], Looking[P, R_co]]:
     """Decorate a verb that looks at a scene."""
-    return _with(options)
+    return partial(_verb, options)
 
 
 def compares(
     options: Callable[P, O_contra],
 ) -> Callable[[Callable[[ScenesLike, CamerasLike, AnyPath | None, O_contra], R_co]], Comparing[P, R_co]]:
     """Decorate a verb that works on several scenes."""
-    return _with(options)
+    return partial(_verb, options)
 
 
-def _with(options: Any) -> Any:
-    def decorate(body: Callable[..., Any]) -> Callable[..., Any]:
-        *given, last = inspect.signature(body).parameters.values()
-        assert last.name == "options"
-        optional = (NoneType in get_args(p.annotation) for p in given)
-        inputs = inspect.Signature([p.replace(default=None) if o else p for p, o in zip(given, optional, strict=True)])
-        body_checked = contract(body)
+def _verb(options: Any, body: Callable[..., Any]) -> Any:
+    *given, last = inspect.signature(body).parameters.values()
+    assert last.name == "options"
+    given = [p.replace(default=None) if NoneType in get_args(p.annotation) else p for p in given]
+    inputs = inspect.Signature(given)
+    body_checked = contract(body)
 
-        @wraps(body)
-        def verb(*args: Any, **keywords: Any) -> Any:
-            own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
-            bound = inputs.bind(*args, **own)
-            bound.apply_defaults()
-            if isinstance(output := bound.arguments.get("output"), str | PathLike):
-                check_name(output)
-            with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
-                for name in keywords.keys() - hints:
-                    raise UsageError(name, f"is no option here{did_you_mean(name, hints)}")
-                return body_checked(*bound.args, options(**keywords))
+    @wraps(body)
+    def verb(*args: Any, **keywords: Any) -> Any:
+        own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
+        bound = inputs.bind(*args, **own)
+        bound.apply_defaults()
+        if isinstance(output := bound.arguments.get("output"), str | PathLike):
+            check_name(output)
+        with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
+            for name in keywords.keys() - hints:
+                raise UsageError(name, f"is no option here{did_you_mean(name, hints)}")
+            return body_checked(*bound.args, options(**keywords))
 
-        hints = get_type_hints(options)  # without what the command line adds to them
-        fields = [p.replace(annotation=hints[name]) for name, p in inspect.signature(options).parameters.items()]
-        signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
-        verb.__doc__ = documented(body.__doc__, options)
-        vars(verb).update(__signature__=signature, options=options)
-        return verb
-
-    return decorate
+    hints = get_type_hints(options)  # without what the command line adds to them
+    fields = [p.replace(annotation=hints[name]) for name, p in inspect.signature(options).parameters.items()]
+    signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
+    verb.__doc__ = documented(body.__doc__, options)
+    vars(verb).update(__signature__=signature, options=options)
+    return verb
