@@ -31,11 +31,6 @@ def fit_of(scene, cameras) -> Agreement:
     return agreement(own_look(scene, TrainingViews.of(scene, cameras), "eager", WHITE), cameras)
 
 
-def without_photos(cameras: CameraSet) -> CameraSet:
-    strip = [tuple(replace(view, photo=None) for view in views) for views in (cameras.train, cameras.test)]
-    return replace(cameras, train=strip[0], test=strip[1])
-
-
 def test_photographs_tell_a_scene_from_one_turned_over(sample_scene, sample_cameras):
     right, wrong = (fit_of(scene, sample_cameras) for scene in (sample_scene, half_turn_about_x(sample_scene)))
     assert right.doubt is None
@@ -97,13 +92,6 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
     assert torch.equal(chosen.gaussians().sh, expected.sh)
 
 
-def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
-    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
-    opened = read_scene(tmp_path / "a.spz")
-    assert opened.other is not None
-    assert settled(opened, cameras_around(opened, Orbit())) is opened
-
-
 def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sample_scene, sample_cameras, caplog):
     scene = replace(sample_scene[torch.arange(3000)], origin=None)  # a copy: the sample is shared
     scene.means[0], scene.sh[1] = torch.nan, 1e5
@@ -137,5 +125,9 @@ def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp
 
 def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_cameras, tmp_path: Path):
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
-    chosen = settled(read_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
+    opened = read_scene(tmp_path / "a.spz")
+    assert opened.other is not None
+    assert settled(opened, cameras_around(opened, Orbit())) is opened  # assumed cameras decide nothing
+    bare = tuple(replace(view, photo=None) for view in sample_cameras.train)
+    chosen = settled(opened, replace(sample_cameras, train=bare, test=bare))
     assert torch.equal(chosen.gaussians().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").gaussians().means)

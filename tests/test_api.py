@@ -11,17 +11,14 @@ from aaplug_cli.verbs import VERBS
 
 import aaplug
 from aaplug.system.errors import UsageError
-from tests.conftest import SAMPLE
-
-README = Path(__file__).parents[1] / "README.md"
-
+from tests.conftest import ROOT, SAMPLE
 
 def test_python_in_the_readme_gives_the_command_lines_image(cli):
     Path("scene.ply").unlink()
     Path("scene.ply").symlink_to(SAMPLE / "chair.ply")
     Path("path/to").mkdir(parents=True)
     Path("path/to/colmap").symlink_to(SAMPLE)
-    found = re.search(r"```python\n(.*?)```", README.read_text(), re.S)
+    found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert found
     Path("readme.py").write_text(found[1])
     image = runpy.run_path("readme.py")["image"]
@@ -58,7 +55,6 @@ def test_verbs_have_the_options_of_the_command_line(verb):
 
 
 def test_every_folder_of_the_library_is_packaged():
-    root = Path(__file__).resolve().parents[1]
-    listed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    folders = {".".join(file.parent.relative_to(root).parts) for file in root.glob("aaplug/**/__init__.py")}
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {".".join(file.parent.relative_to(ROOT).parts) for file in ROOT.glob("aaplug/**/__init__.py")}
     assert set(listed) == folders | {"aaplug_cli", "aaplug_cli.guides"}

@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,7 +65,7 @@ def timeless(folder: Path) -> dict[str, str]:
     return found
 
 
-def test_a_broken_scene_stops_no_other_and_is_named(batch):
+def test_a_broken_scene_stops_no_other_and_is_named_and_added_by_resuming_when_it_is_mended(batch):
     code, out, err = batch("evaluate --batch batch.toml")
     assert code == 1
     assert "failed" in out
@@ -81,10 +83,6 @@ def test_a_broken_scene_stops_no_other_and_is_named(batch):
     lines = Path("out/results.csv").read_text().splitlines()
     assert len(lines) == 1 + 3 * 3  # ceiling and two recipes, three views
     assert "r_0" in lines[1]
-
-
-def test_a_mended_scene_is_added_by_resuming_and_the_other_not_redone(batch):
-    batch("evaluate --batch batch.toml")
     before = Path("out/whole/progress.jsonl").read_bytes()
     batch.refused("evaluate --batch batch.toml")  # there are results already
     shutil.copy("scene.ply", "broken.ply")
@@ -102,27 +100,18 @@ def test_errors_of_a_scene_name_options_as_they_are_typed(batch, monkeypatch, ve
     assert "lower --min-seen" in json.loads(out)["scenes"]["scene"]["error"]
     assert "min_seen" not in out + err + Path("out/batch.json").read_text()
 
-    def full(*words, **settings):
-        raise MemoryError
-
     monkeypatch.setattr(f"aaplug.{verb}", full)
     code, out, err = batch(f"{verb} --batch one.toml -o out --json --overwrite")
     assert "fewer --threads" in json.loads(out)["scenes"]["scene"]["error"]
 
 
-def test_scenes_of_the_command_line_share_their_cameras(batch):
-    shutil.copy("scene.ply", "other.ply")
-    words = "scene.ply other.ply --cameras . -o out --rasterizer eager --recipe matched --scale 0.5 --json"
-    out, _ = batch.done(f"evaluate {words}")
-    assert set(json.loads(out)["scenes"]) == {"scene", "other"}
-    assert json.loads(out)["mean"]["matched@0.5"]["SSIM"] > 0.5
-
-
-def test_overwriting_a_batch_removes_scenes_that_it_has_no_more(batch):
+def test_scenes_of_the_command_line_share_cameras_and_overwriting_removes_those_that_it_has_no_more(batch):
     for name in ("b.ply", "c.ply"):
         shutil.copy("scene.ply", name)
     words = "--cameras . -o out --rasterizer eager --recipe matched --scale 0.5"
-    assert batch(f"evaluate scene.ply b.ply c.ply {words}")[0] == 0
+    found = json.loads(batch.done(f"evaluate scene.ply b.ply c.ply {words} --json")[0])
+    assert set(found["scenes"]) == {"scene", "b", "c"}
+    assert found["mean"]["matched@0.5"]["SSIM"] > 0.5
     Path("out/c/note.txt").touch()
     assert batch(f"evaluate scene.ply broken.ply {words} --overwrite")[0] == 1
     left = {str(path.relative_to("out")) for path in Path("out").glob("*/*")}
@@ -194,40 +183,31 @@ def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
     assert shared == {"cull_margin": 0.3}
     expected = {"scene": str(tmp_path / "x/a.ply"), "cameras": "/abs", "test_every": 8}
     assert scenes == {"a": expected}
+    with pytest.raises(FormatError, match="no such file"):
+        read_batch(tmp_path / "gone.toml")
 
 
 def test_a_file_can_take_back_what_the_command_line_sets(batch):
     Path("batch.toml").write_text(
         SETTINGS.split("[[scene]]")[0]
-        + """
-[[scene]]
-scene = "scene.ply"
-cameras = "."
-report = false
-drop-bad = false
-"""
+        + '[[scene]]\nscene = "scene.ply"\ncameras = "."\nreport = false\ndrop-bad = false\n'
     )
     batch.done("evaluate --batch batch.toml --report --drop-bad")
     assert Path("out/scene/results.json").is_file()
     assert not Path("out/scene/report.html").exists()
 
 
-def test_a_missing_batch_file_is_named(tmp_path):
-    with pytest.raises(FormatError, match="no such file"):
-        read_batch(tmp_path / "gone.toml")
-
-
-def report_of(**values: float | None):
+def report_of(scale: float = 1.0, protocol: Mapping[str, Any] | None = None, **values: float | None):
     """A run that measures these values without rendering."""
-    measured = Measurement("auto", 1.0, "view", values, 1, 0.1)
-    return lambda **settings: Report((measured,), {"recipes": {}})
+    measured = Measurement("auto", scale, "view", values, 1, 0.1)
+    return lambda **settings: Report((measured,), protocol or {"recipes": {}})
 
 
 def mistaken(**settings):
     raise ValueError("oh")
 
 
-def full(**settings):
+def full(*words, **settings):
     raise MemoryError
 
 
@@ -257,11 +237,7 @@ def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_o
     def refused(**settings):
         raise UsageError("progress.jsonl", "is of another request")
 
-    def at(scale: float):
-        measured = Measurement("auto", scale, "view", {"PSNR": 30.0}, 1, 0.1)
-        return lambda **settings: Report((measured,), {"recipes": {}})
-
-    found = evaluate_all([("x", at(1.0)), ("y", at(0.5))], tmp_path / "out")
+    found = evaluate_all([("x", report_of(PSNR=30.0)), ("y", report_of(0.5, PSNR=30.0))], tmp_path / "out")
     assert "no PSNR at 1: some scenes have other scales" in found.tables()
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
     found = evaluate_all([("x", refused), ("y", refused)], tmp_path / "out", resume=True)
@@ -274,11 +250,8 @@ def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_o
     [("protocol", "protocols"), ("truth", "truths"), ("downscale", "ways of downscaling"), ("metrics", "flavours")],
 )
 def test_figures_of_several_protocols_are_not_averaged(tmp_path, part, words):
-    def by(choice: str):
-        measured = Measurement("auto", 1.0, "view", {"SSIM": 0.9, "PSNR": 30.0}, 1, 0.1)
-        return lambda **settings: Report((measured,), {part: {"SSIM": choice}})
-
-    found = evaluate_all([("x", by("wang")), ("y", by("3dgs"))], tmp_path / "out")
+    runs = [(name, report_of(protocol={part: {"SSIM": name}}, SSIM=0.9, PSNR=30.0)) for name in ("wang", "3dgs")]
+    found = evaluate_all(runs, tmp_path / "out")
     assert found.summary()["mean"] == {"auto@1": {"SSIM": None, "PSNR": 30.0 if part == "metrics" else None}}
     assert f"no SSIM at 1: the scenes' {words} differ" in found.tables()
 

@@ -122,15 +122,12 @@ def model(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_number_of_gaussians_is_refused_beside_a_scene(model):
-    with pytest.raises(UsageError, match="gaussians: are of synthetic scenes"):
-        bench(model / "whole.ply", gaussians=(300,), rasterizer="eager")
-
-
 @pytest.mark.parametrize("scene", ["levels", "whole.ply"])
 def test_a_scene_is_timed_as_it_is_drawn_at_the_sizes_that_are_asked_for(model, scene):
     cameras = CameraSet(*[(make_camera(),)] * 2)
     how = {"rasterizer": "eager", "repeats": 1}
+    with pytest.raises(UsageError, match="gaussians: are of synthetic scenes"):
+        bench(model / scene, gaussians=(300,), **how)
     runs = [
         *bench(model / scene, cameras, **how).runs,
         *bench(model / scene, cameras, resolution=("64x48", "16x12"), **how).runs,

@@ -35,13 +35,6 @@ def test_render_writes_a_resolution(cli, resolution, size):
     assert image_size(Path("one.png")) == size
 
 
-def test_render_writes_16_bits(cli):
-    cli.done("render scene.ply --cameras . -o one.png --bit-depth 16")
-    pixels = cv2.imread("one.png", cv2.IMREAD_UNCHANGED)
-    assert pixels.dtype == np.uint16
-    assert len(np.unique(pixels)) > 256
-
-
 def test_render_selects_views(cli):
     words = "--recipe classic --quality best --rate-reference global"
     code, out, err = cli(f"render scene.ply --cameras . -o out --views train --scale 0.25 --json {words}")
@@ -52,8 +45,11 @@ def test_render_selects_views(cli):
     assert all(Path(image["file"]).is_file() for image in images)
 
 
-def test_render_one_file_of_cameras_serves_as_both(cli):
-    cli.done("render scene.ply --cameras transforms_test.json -o one.png")
+def test_render_by_one_file_of_cameras_which_serves_as_both_in_16_bits(cli):
+    cli.done("render scene.ply --cameras transforms_test.json -o one.png --bit-depth 16")
+    pixels = cv2.imread("one.png", cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint16
+    assert len(np.unique(pixels)) > 256
 
 
 def test_render_takes_an_inria_model_folder_as_it_is(cli):
@@ -95,11 +91,6 @@ def break_frame(folder: Path) -> None:
 CONVERT = "convert scene.ply --cameras . -o new.ply"
 RENDER = "render scene.ply --cameras . -o new"
 VIDEO = "video scene.ply --cameras . -o new.webm"
-BROKEN = {
-    "NaN means": (break_nan, CONVERT, ["scene.ply", "row 3", "1 more", "--drop-bad"]),
-    "cameras of another scene": (break_frame, CONVERT, ["scene.ply", "different frames"]),
-    "frame, on render": (break_frame, RENDER, ["scene.ply", "different frames"]),
-}
 BARE = "render scene.ply -o new"
 EVALUATE = "evaluate scene.ply --cameras . -o new"
 LOD = "lod scene.ply"
@@ -166,9 +157,14 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_broken_files_are_refused_and_nothing_is_written(cli, case):
-    spoil, words, named = BROKEN[case]
+@pytest.mark.parametrize(
+    ("spoil", "words", "named"),
+    [
+        (break_nan, CONVERT, ["scene.ply", "row 3", "1 more", "--drop-bad"]),
+        *((break_frame, words, ["scene.ply", "different frames"]) for words in (CONVERT, RENDER)),
+    ],
+)
+def test_broken_files_are_refused_and_nothing_is_written(cli, spoil, words, named):
     spoil(Path())
     cli.refused(words, *named)
 
@@ -219,7 +215,7 @@ def inria_model(folder: Path, config: str) -> Path:
 
 @pytest.mark.parametrize(
     ("entry", "words"),
-    [("main", "render --help"), ("program", "render --help"), ("main", "recipes"), ("program", "--version")],
+    [("main", "render --help"), ("program", "render --help"), ("main", "viewers"), ("program", "--version")],
 )
 def test_a_reader_that_leaves_early_is_no_failure(entry, words):
     program = [sys.executable, "-c", f"from aaplug_cli.main import {entry}; {entry}()", *words.split()]
@@ -231,7 +227,7 @@ def test_a_reader_that_leaves_early_is_no_failure(entry, words):
     assert (run.returncode, err) == (0, "")
 
 
-@pytest.mark.parametrize(("closed", "words", "code"), [(1, "recipes", 0), (2, "recipes", 0), (2, "render", 2)])
+@pytest.mark.parametrize(("closed", "words", "code"), [(1, "viewers", 0), (2, "viewers", 0), (2, "render", 2)])
 def test_a_stream_that_the_caller_closed_is_written_nowhere(closed, words, code):
     program = f"import os; os.close({closed}); os.execv({sys.executable!r}, ['python', '-c', {START!r}, {words!r}])"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -247,10 +243,10 @@ def test_a_folder_that_matplotlib_makes_where_home_is_read_only_goes(tmp_path, g
     assert tmp_path.exists() == given
 
 
-@pytest.mark.parametrize(("words", "code"), [(["info", "scene.ply", "--json"], 0), (["info"], 2)])
-def test_the_program_ends_at_once_with_all_said(dataset, words, code):
+@pytest.mark.parametrize(("words", "code"), [(["viewers", "--json"], 0), (["info"], 2)])
+def test_the_program_ends_at_once_with_all_said(words, code):
     program = "import atexit; atexit.register(print, 'late'); from aaplug_cli.main import program; program()"
-    run = subprocess.run([sys.executable, "-c", program, *words], cwd=dataset, capture_output=True, text=True)
+    run = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
     assert run.returncode == code
     assert bool(run.stdout) == (code == 0)
     assert "late" not in run.stdout

@@ -47,17 +47,13 @@ def test_commas_part_values_as_spaces_do(cli, several):
     assert Path("a,b/results.json").is_file()
 
 
-def test_without_photographs_it_takes_the_scenes_own_look(cli):
-    words = "evaluate scene.ply --cameras . --views train --scale 0.5 --recipe mip --json"
-    out, err = cli.done(words)
-    assert "truth: self (0 of 3 views with a photograph)" in err
-    assert json.loads(out)["_aaplug"]["truth"] == "self"
-
-
-def test_all_leaves_out_what_does_not_suit_the_scene(cli):
-    out, err = cli.done("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
+def test_all_leaves_out_what_does_not_suit_the_scene_whose_own_look_is_the_truth_without_photographs(cli):
+    out, err = cli.done("evaluate scene.ply --cameras . --views r_1 --recipe all --scale 0.25 --json")
     assert "recipe multi-scale left out: the scene lacks" in err
-    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale", "learned"}
+    assert "truth: self (0 of 1 view with a photograph)" in err
+    about = json.loads(out)["_aaplug"]
+    assert set(about["recipes"]) == set(RECIPES) - {"multi-scale", "learned"}
+    assert about["truth"] == "self"
 
 
 def test_a_protocol_names_itself_and_its_flavours(cli):
