@@ -13,6 +13,7 @@ import aaplug
 from aaplug.system.errors import UsageError
 from tests.conftest import ROOT, SAMPLE
 
+
 def test_python_in_the_readme_gives_the_command_lines_image(cli):
     Path("scene.ply").unlink()
     Path("scene.ply").symlink_to(SAMPLE / "chair.ply")

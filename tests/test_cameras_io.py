@@ -103,6 +103,8 @@ def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
     with_photo, without = read_cameras(tmp_path).train
     assert (with_photo.width, with_photo.photo) == (100, tmp_path / "images_4" / "a.JPG")
     assert (without.width, without.photo) == (100, None)
+    photo(tmp_path / "images_4" / "b.png", 100, 200)
+    refused(tmp_path, "100×200 px, which is not the shape")
 
 
 def test_names_of_inria_lose_a_suffix_that_tells_no_views_apart(tmp_path):
@@ -113,11 +115,6 @@ def test_names_of_inria_lose_a_suffix_that_tells_no_views_apart(tmp_path):
     assert cameras.train[1].photo == tmp_path / "images" / "c" / "a.JPG"
     views = [inria_entry("a.png"), inria_entry("a.jpg")]
     assert names(read_cameras(inria(tmp_path, *views)).train) == ["a.jpg", "a.png"]
-
-
-def test_photo_of_another_shape_is_refused(tmp_path):
-    photo(tmp_path / "images" / "a.png", 100, 200)
-    refused(inria(tmp_path), "100×200 px, which is not the shape")
 
 
 def test_inria_split_goes_by_name(tmp_path):
@@ -162,11 +159,8 @@ def test_cfg_args_is_never_run(tmp_path):
     ],
     ids=range(12),
 )
-def test_odd_cfg_args_are_refused(tmp_path, cfg):
+def test_odd_cfg_args_are_refused_and_those_of_windows_read_without_warnings(tmp_path, cfg):
     refused(inria(tmp_path, cfg=cfg))
-
-
-def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
     (tmp_path / "cfg_args").write_text(r"Namespace(source_path='D:\data\scene', resolution=2)")
     assert read_cfg_args(tmp_path / "cfg_args").resolution == 2
 
@@ -184,7 +178,6 @@ def test_where_training_had_its_photos_is_told_and_not_read(tmp_path):
     ("change", "message"),
     [
         ({"fx": 0}, "camera 1: fx should be from 1e-06 to 1e+09 px, not 0"),
-        ({"fx": 1e-300}, "camera 1: fx should be from 1e-06 to 1e+09 px, not 1e-300"),
         ({"fx": True}, "camera 1: fx should be a number, not True"),
         ({"fx": 10**400}, "camera 1: fx should be a finite number"),
         ({"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
@@ -219,12 +212,9 @@ def test_rotation_is_made_orthonormal(tmp_path):
     ["", "{}", "[]", "[1]", "[" * 100_000, '[{"id": Infinity}]', '[{"width": ' + "9" * 5000 + "}]", "\xff"],
     ids=range(8),
 )
-def test_odd_json_is_refused(tmp_path, text):
+def test_odd_json_is_refused(tmp_path, text, monkeypatch):
     (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
     refused(tmp_path)
-
-
-def test_json_is_capped(tmp_path, monkeypatch):
     monkeypatch.setenv("AAPLUG_JSON", "100")
     refused(inria(tmp_path), "longer than 100 bytes")
 
@@ -324,27 +314,19 @@ def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
 
 
 @pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
-def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, write):
-    straight = one_camera(4, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 0.0))
-    cameras = read_cameras(write(tmp_path / "a", *straight))
-    assert cameras.train[0].fy == 310
-    assert not any("distorts" in note for note in cameras.notes)
-    for model, coefficients in ((4, (0.0, 0.0, 0.0, 1e-9)), (5, (0.0,) * 4)):
-        folder = tmp_path / f"m{model}"
-        photo(folder / "images" / "a.png", 200, 100)
-        bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *coefficients))
-        path = write(folder / "sparse", *bent).parent
-        cameras = read_cameras(path, undistort=True)
-        (camera,) = cameras.train
-        assert values(camera) == (150, 155, 100, 50), "at its photo's size"
-        assert camera.photo is not None
-        assert camera.lens == PINHOLE
-        assert camera.undistortion is not None
-        lens = opencv_lens(coefficients, fisheye=model == 5)
-        assert (camera.undistortion.lens, camera.undistortion.window) == (lens, (0, 0, 200, 100))
-        (bent_camera,) = read_cameras(path).train
-        assert (bent_camera.lens, bent_camera.undistortion, bent_camera.photo) == (lens, None, camera.photo)
-        assert f"1 camera with a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
+@pytest.mark.parametrize(("model", "coefficients"), [(4, (0.0,) * 4), (4, (0.0, 0.0, 0.0, 1e-9)), (5, (0.0,) * 4)])
+def test_a_colmap_lens_has_its_coefficients_in_order(tmp_path, write, model, coefficients):
+    photo(tmp_path / "images" / "a.png", 200, 100)
+    path = write(tmp_path / "sparse", *one_camera(model, (300.0, 310.0, 200.0, 100.0, *coefficients))).parent
+    cameras = read_cameras(path, undistort=True)
+    (camera,), (bent,) = cameras.train, read_cameras(path).train
+    lens = opencv_lens(coefficients, fisheye=model == 5) if model == 5 or any(coefficients) else PINHOLE
+    assert values(camera) == values(bent) == (150, 155, 100, 50), "at its photo's size"
+    assert (camera.lens, bent.lens, bent.photo) == (PINHOLE, lens, camera.photo)
+    assert (camera.undistortion is None) == (lens == PINHOLE)
+    assert camera.undistortion is None or camera.undistortion.lens == lens
+    distorts = f"1 camera with a lens that distorts ({MODEL_NAMES[model]})"
+    assert any(distorts in note for note in cameras.notes) == (lens != PINHOLE)
 
 
 def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
@@ -541,18 +523,15 @@ def test_what_is_not_read_beside_the_cameras_is_told(tmp_path):
     told = "\n".join(cameras.notes)
     assert "masks are not read" in told
     assert "nerfstudio halves larger ones: `train_scale` sets it" in told
-    assert "train_scale" not in "".join(read_cameras(path, train_scale=0.5).notes[:-1]).replace(
-        "0.5: `train_scale`", ""
-    )
+    told = "".join(read_cameras(path, train_scale=0.5).notes[:-1])
+    assert "train_scale" not in told.replace("0.5: `train_scale`", "")
     colmap_bin(tmp_path / "sparse" / "0")
     colmap_bin(tmp_path / "sparse" / "1")
     (tmp_path / "masks").mkdir()
     (tmp_path / "images_4").mkdir()
     told = "\n".join(read_cameras(tmp_path).notes)
     assert "masks are not read" in told
-    assert (
-        "photos: images holds none of these cameras' (a.b.png); `images` names another folder, such as images_4" in told
-    )
+    assert "photos: images holds none of these cameras' (a.b.png); `images` names another folder, such as" in told
     assert "other models beside 0, not read: 1" in told
     assert "other cameras in the folder, not read: transforms.json (nerfstudio, instant-ngp)" in told
 

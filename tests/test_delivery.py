@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.conventions import MIP
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.gltf import Gltf, glb_start
 from aaplug.io.scenes import read_scene, write_scene
@@ -263,12 +262,6 @@ def test_usd_scenes_without_the_package_name_the_extra(tmp_path: Path, monkeypat
     with pytest.raises(UsageError, match=r"needs pxr: .*\[usd\]"):
         write_scene(tmp_path / "b.usdz", oracle())
     assert [file.name for file in tmp_path.iterdir()] == ["a.usda"]
-
-
-def test_the_convention_stays_in_a_usd(tmp_path: Path):
-    pytest.importorskip("pxr")
-    write_scene(tmp_path / "a.usdc", replace(oracle(), convention=MIP, origin=None))
-    assert read_scene(tmp_path / "a.usdc").evidence == "aaplug's record in the file: mip"
 
 
 # Codebooks

@@ -140,15 +140,7 @@ def test_work_of_other_programs_is_counted_and_own_work_is_not() -> None:
     assert own[2] - own[1] >= seconds
 
 
-def test_torch_has_as_many_threads_as_cores_are_free_and_then_its_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FREE_CORES, "count", lambda: 1)
-    with torch_threads(2):
-        with on_free_cores():
-            assert torch.get_num_threads() == 1
-        assert torch.get_num_threads() == 2
-
-
-def test_inside_a_block_with_fewer_threads_free_cores_are_counted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_has_as_many_threads_as_cores_are_free_in_blocks_with_fewer_too(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch_threads(2):
         monkeypatch.setattr(FREE_CORES, "count", lambda: 1)
         with on_free_cores():
@@ -159,6 +151,7 @@ def test_inside_a_block_with_fewer_threads_free_cores_are_counted_anew(monkeypat
             with torch_threads(1), on_free_cores():
                 assert (torch.get_num_threads(), given_threads()) == (1, 1)
             assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
 
 
 def test_a_verb_draws_with_the_threads_it_was_given_and_does_the_rest_with_one(tmp_path, monkeypatch, sample_scene):

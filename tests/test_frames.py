@@ -7,7 +7,7 @@ import pytest
 from aaplug.io.image_formats import Storage
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.executors import ProcessesIfLong, torch_threads
+from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 VIEWS = [make_camera((x / 2, -4.0, 0.3), (40, 30), name=f"v{x}") for x in range(4)]
@@ -41,11 +41,3 @@ def test_little_work_starts_no_process(renderer, paths, monkeypatch):
     monkeypatch.setattr("aaplug.system.executors.Processes", None)
     write_frames(renderer, VIEWS, paths, ProcessesIfLong(8).map)
     assert all(path.is_file() for path in paths)
-
-
-def test_threads_change_no_bit(renderer):
-    images = []
-    for threads in (1, 2):
-        with torch_threads(threads):
-            images.append(renderer(VIEWS[0]).rgb)
-    assert images[0].equal(images[1])

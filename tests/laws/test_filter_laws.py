@@ -8,13 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.conventions import CLASSIC, CONVENTIONS, MIP
+from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.projection import project
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.laws.filters import CAMERAS, F64, SCENE, SITUATIONS, spheres, trained_with, world_scene
 from aaplug.lab.filters import AnisotropicSmoothing, FlatSmoothing
 from aaplug.methods import SCREEN_FILTERS, WORLD_FILTERS
-from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE, PIXEL_VARIANCE, Matched
 from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
@@ -22,6 +21,9 @@ from tests.conftest import each, make_camera, make_scene, make_splats
 
 situation = each(SITUATIONS)
 convention = each(CONVENTIONS)
+# one Gaussian at the origin, trained from 4 and from 8 away
+ONE = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
+TWICE = TrainingViews.of(ONE, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
 
 
 @pytest.mark.parametrize(
@@ -33,16 +35,6 @@ def test_a_dilation_has_its_published_constant_at_every_rate(name, variance, com
     filtered = SCREEN_FILTERS[name](splats, situation.view, situation.training)
     torch.testing.assert_close(filtered.covs, expected.covs)
     torch.testing.assert_close(filtered.opacities, expected.opacities)
-
-
-@pytest.mark.parametrize("sigma", [0.03, 0.1, 0.5, 2.0])
-@pytest.mark.parametrize("variance", [0.1, 0.3])
-def test_a_compensated_dilation_keeps_energy_down_to_its_floor(variance, sigma):
-    splats = spheres(sigma)
-    dilation = Dilation(variance, compensated=True)
-    filtered = dilation(splats, CAMERAS[0], trained_with(CLASSIC))
-    factor = max(sigma**2 / (sigma**2 + variance), 0.005)
-    torch.testing.assert_close(filtered.opacities, splats.opacities * factor)
 
 
 @pytest.mark.parametrize("pixel", [0.0, PIXEL_VARIANCE])
@@ -84,29 +76,19 @@ def test_matching_the_sharpest_rate_is_thinner_where_another_view_sampled_more_f
     ],
 )
 def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(depth, in_sharpest, in_interval, in_pose):
-    # one Gaussian at the origin, trained from 4 and from 8 away
-    scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
     free = replace(make_camera((0.0, -depth, 0.0)), trained_focal=None)
-    splats = project(scene, free)
-    rates = {
-        name: Matched(name).rates(splats, free, training).item() for name in ("global", "sharpest", "interval", "pose")
-    }
-    assert rates["global"] == pytest.approx(1.0)
-    assert rates["sharpest"] == pytest.approx(in_sharpest)
-    assert rates["interval"] == pytest.approx(in_interval)
-    assert rates["pose"] == pytest.approx(in_pose)
+    references = ("global", "sharpest", "interval", "pose")
+    rates = [Matched(name).rates(project(ONE, free), free, TWICE).item() for name in references]
+    assert rates == pytest.approx([1.0, in_sharpest, in_interval, in_pose])
 
 
 @pytest.mark.parametrize("scale", [4.0, 1.0, 0.95, 0.5, 0.1])
 @pytest.mark.parametrize(("pose", "highest"), [(4.0, 1.0), (4.3, 4.3 / 4), (8.0, 2.0)])
 def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(scale, pose, highest):
-    """One Gaussian trained from 4 and from 8 away, seen from a held-out pose of the data set."""
-    scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
+    """Seen from a held-out pose of the data set."""
     view = make_camera((0.0, -pose, 0.0))
     view = replace(view, fx=view.fx * scale, fy=view.fy * scale)
-    rate = Matched("pose").rates(project(scene, view), view, training).item()
+    rate = Matched("pose").rates(project(ONE, view), view, TWICE).item()
     octaves = -math.log2(scale) / -math.log2(FULL_RISE_AT)  # of those that the rate rises over
     against = min(highest, MAX_RISE ** min(1.0, octaves)) if scale < 1 else 1.0
     assert rate == pytest.approx(scale / against)
@@ -114,13 +96,10 @@ def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(s
 
 @pytest.mark.parametrize("reference", ["pose", "sharpest", "interval"])
 def test_gaussians_that_no_camera_saw_are_matched_at_the_rate_of_the_view(reference):
-    scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    elsewhere = replace(CAMERAS[0], cx=1e4)
-    training = TrainingViews.of(scene, [elsewhere])
+    training = TrainingViews.of(ONE, [replace(CAMERAS[0], cx=1e4)])
     assert not training.bounds.seen.any()
     view = CAMERAS[0].scaled(0.5)
-    splats = project(scene, view)
-    assert Matched(reference).rates(splats, view, training).tolist() == [0.5]
+    assert Matched(reference).rates(project(ONE, view), view, training).tolist() == [0.5]
 
 
 @pytest.mark.parametrize("compensate", [False, True])
