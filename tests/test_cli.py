@@ -52,17 +52,14 @@ def test_render_by_one_file_of_cameras_which_serves_as_both_in_16_bits(cli):
     assert len(np.unique(pixels)) > 256
 
 
-def test_render_takes_an_inria_model_folder_as_it_is(cli):
+def test_render_takes_an_inria_model_folder_as_it_is_and_a_scene_in_it_from_anywhere(cli, monkeypatch):
     model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
     assert "background: white (from the camera files)" in cli.done(f"render -m {model} -o out --views all")[1]
     assert cv2.imread("out/a.png")[0, 0].min() > 200
     assert image_size(Path("out/a.png")) == (32, 24)  # cameras.json holds the source's size; training was at -r 2
     cli.done(f"render {model} -o again --iteration 7 --views a")
     cli.refused(f"render {model} -o again --iteration 8 --views a --overwrite", "has no iteration 8; it has 7, 30")
-
-
-def test_a_scene_in_a_model_folder_has_its_cameras_wherever_it_is_named_from(cli, monkeypatch):
-    monkeypatch.chdir(inria_model(Path("model"), "Namespace(eval=False)") / "point_cloud")
+    monkeypatch.chdir(model / "point_cloud")
     cli.done("render iteration_7/point_cloud.ply -o out --views a")
     monkeypatch.chdir("iteration_7")
     cli.done("render point_cloud.ply -o out --views a")
