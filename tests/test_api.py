@@ -30,12 +30,10 @@ def test_python_in_the_readme_gives_the_command_lines_image(cli):
     assert image[0, 0].min() == 1  # the chair's cameras say white
 
 
-@pytest.mark.parametrize("recipe", ["mip-splatting", "matched"])
-def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):
+def test_a_renderer_applies_the_recipes_world_filter(cli):
     scene, cameras = aaplug.read_scene("scene.ply").gaussians(), aaplug.read_cameras(".")
-    image = aaplug.Renderer.of(scene, cameras, recipe)(cameras.test[0].scaled(0.5)).rgb
-    words = f"render scene.ply --cameras . -o one.png --scale 0.5 --recipe {recipe}"
-    cli.done(f"{words} --bit-depth 16")
+    image = aaplug.Renderer.of(scene, cameras, "mip-splatting")(cameras.test[0].scaled(0.5)).rgb
+    cli.done("render scene.ply --cameras . -o one.png --scale 0.5 --recipe mip-splatting --bit-depth 16")
     aaplug.write_png("two.png", image, bit_depth=16)
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
 

@@ -149,13 +149,6 @@ def killed_at(stop: int):
     return adding
 
 
-def test_resuming_another_request_is_refused(batch):
-    words = "evaluate scene.ply --cameras . -o one --rasterizer eager --recipe classic --scale"
-    batch.done(f"{words} 1")
-    code, _, err = batch(f"{words} 0.5 --resume")
-    assert (code, "is of another request (scales changed since)" in err) == (2, True)
-
-
 REFUSED = {
     "no toml": ("scene = [", "should be TOML"),
     "no scene": ("output = 'out'", "names no scene"),

@@ -334,10 +334,6 @@ def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cac
     assert len(packed) < 1000
 
 
-def test_an_empty_cache_loads_nothing(empty_cache):
-    assert compiled.load() is None
-
-
 def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
     return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
 
@@ -465,6 +461,7 @@ def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cach
 def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, compiler):
     monkeypatch.setattr(choice, "has_compiler", lambda: compiler)
     monkeypatch.setenv("AAPLUG_KERNELS", "/nowhere")
+    assert compiled.load() is None
     said: list[str] = []
     assert find_rasterizer("auto", 1, said.append) is RASTERIZERS["eager"]
     assert len(said) == 1

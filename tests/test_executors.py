@@ -66,13 +66,6 @@ def test_a_disk_that_is_full_is_named(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_torch_threads_are_given_back():
-    before = torch.get_num_threads()
-    with torch_threads(before + 1):
-        assert torch.get_num_threads() == before + 1
-    assert torch.get_num_threads() == before
-
-
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
 def test_kept_memory_is_not_fetched_again():
     script = """if True:
@@ -141,6 +134,7 @@ def test_work_of_other_programs_is_counted_and_own_work_is_not() -> None:
 
 
 def test_torch_has_as_many_threads_as_cores_are_free_in_blocks_with_fewer_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = torch.get_num_threads()
     with torch_threads(2):
         monkeypatch.setattr(FREE_CORES, "count", lambda: 1)
         with on_free_cores():
@@ -152,6 +146,7 @@ def test_torch_has_as_many_threads_as_cores_are_free_in_blocks_with_fewer_too(mo
                 assert (torch.get_num_threads(), given_threads()) == (1, 1)
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 2
+    assert torch.get_num_threads() == before
 
 
 def test_a_verb_draws_with_the_threads_it_was_given_and_does_the_rest_with_one(tmp_path, monkeypatch, sample_scene):

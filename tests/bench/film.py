@@ -1,14 +1,9 @@
-"""The film camera: passes, files and frame sequences, lenses, aperture and shutter."""
+"""The film camera: passes and files, lenses, aperture and shutter; `kills` has frame sequences."""
 
 import math
-import os
-import random
-import signal
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -23,8 +18,7 @@ from aaplug.evaluation.report.contact_sheet import labelled
 from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_rgba, write_png
 from aaplug.io.layers import write_layers
-from tests.bench import film_aperture, film_lenses, heading, row
-from tests.bench.kills import PROGRAM
+from tests.bench import film_aperture, film_lenses, heading, row, timed
 from tests.conftest import SAMPLE, make_camera, make_scene
 from tests.test_passes import plane_errors
 
@@ -69,18 +63,12 @@ def cost_of_passes() -> None:
         "times rgb",
     )
 
-    def seconds(names: list[str]) -> float:
-        times = []
-        for _ in range(3):
-            start = time.perf_counter()
-            renderer.passes(view, names)
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    renderer(view)
-    alone = seconds(["rgb"])
-    for names in (["rgb", "alpha"], *([name] for name in PASSES if name not in ("rgb", "alpha")), list(PASSES)):
-        row(" ".join(names) if len(names) < len(PASSES) else "all", seconds(names) / alone)
+    several = {"rgb": ["rgb"], "rgb alpha": ["rgb", "alpha"], **{n: [n] for n in PASSES if n not in ("rgb", "alpha")}}
+    several["all"] = list(PASSES)
+    times = timed({name: partial(renderer.passes, view, names) for name, names in several.items()}, 3, min)
+    alone = times.pop("rgb")
+    for name, seconds in times.items():
+        row(name, seconds / alone)
 
 
 def truth_of_passes() -> None:
@@ -133,37 +121,7 @@ def channels_of_file(path: Path) -> tuple[Tensor, Tensor]:
     return rgba[..., :3], rgba[..., 3:]
 
 
-def kills_of_a_sequence() -> None:
-    """A sequence of 240 frames, killed at five random moments, against one that nothing stopped."""
-    columns = "killed after frames", "frames there", "earlier ones drawn again"
-    heading("240 frames of 640x360 px as .exr, two processes", *columns)
-    words = f"video {SAMPLE / 'chair.ply'} --cameras {SAMPLE} --resolution 640x360 --seconds 8 --fps 30 --threads 2"
-    words, quiet = words + " --passes rgb,alpha,depth --resume -o", subprocess.DEVNULL
-    with tempfile.TemporaryDirectory() as folder:
-
-        def started(name: str) -> "subprocess.Popen[bytes]":
-            command = [sys.executable, "-c", PROGRAM, *words.split(), f"{folder}/{name}/frame.####.exr"]
-            return subprocess.Popen(command, stderr=quiet, stdout=quiet, start_new_session=True)
-
-        begun = time.perf_counter()
-        assert started("whole").wait() == 0
-        whole, kept, chance = time.perf_counter() - begun, dict[Path, int](), random.Random(0)
-        for count in sorted(chance.sample(range(5, 235), 5)):
-            run = started("killed")
-            while len(list(Path(folder, "killed").glob("frame.*.exr"))) < count:
-                time.sleep(0.01)
-            time.sleep(chance.random())
-            os.killpg(run.pid, signal.SIGKILL)
-            run.wait()
-            there = {path: path.stat().st_mtime_ns for path in Path(folder, "killed").glob("frame.*.exr")}
-            row(count, len(there), sum(there[path] != then for path, then in kept.items()))
-            kept = there
-        assert started("killed").wait() == 0
-        one, other = ({p.name: p.read_bytes() for p in Path(folder, name).iterdir()} for name in ("whole", "killed"))
-        row(f"resumed; {whole:.1f} unbroken", len(other) - 1, "same bytes" if one == other else "OTHER BYTES")
-
-
-LINES: list[Callable[[], None]] = [truth_of_passes, straight_files, cost_of_passes, kills_of_a_sequence]
+LINES: list[Callable[[], None]] = [truth_of_passes, straight_files, cost_of_passes]
 
 
 def main(pictures: Path | None = None, only: Literal["passes", "lenses", "aperture"] | None = None) -> None:

@@ -69,6 +69,7 @@ JOBS = {
     ),
     "lod": Job(f"lod {SCENE} -o out/levels --levels 2 --no-refine"),
     "video": Job(f"video {SCENE} -o out/v.webm --scale 0.125 --seconds 0.3 --beside none"),
+    "sequence": Job(f"video {SCENE} -o out/f/frame.####.png --scale 0.125 --seconds 0.3 --threads 2", "--resume"),
     "batch": Job("evaluate --batch batch.toml -o out/many", "--resume"),
     "cluster": Job(f"{EVALUATION} auto --layout inria --views test", "--resume", "--scheduler local --threads 3"),
 }
