@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -192,6 +192,20 @@ def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, fl
     angle = 2 * math.atan(0.5 * SIZE[0] / cameras[0].fx)
     data = {"camera_angle_x": angle, "w": SIZE[0], "h": SIZE[1], "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+
+
+def write_model(folder: Path, cameras: Iterable[Camera], config: str, scene: Gaussians, *iterations: int) -> Path:
+    """A model folder as 3DGS writes it."""
+    for iteration in iterations:
+        write_scene(folder / f"point_cloud/iteration_{iteration}/point_cloud.ply", scene)
+    entries = [
+        {"id": number, "img_name": view.name, "width": view.width, "height": view.height, "fx": view.fx, "fy": view.fy}
+        | {"position": view.centre.tolist(), "rotation": view.cam_from_world[:3, :3].T.tolist()}
+        for number, view in enumerate(cameras)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    (folder / "cfg_args").write_text(f"Namespace({config})")
+    return folder
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -9,12 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from plyfile import PlyData
 
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
-from tests.conftest import EYES, SIZE, make_camera, make_scene
+from tests.conftest import EYES, SIZE, make_camera, make_scene, write_model
 from tests.test_startup import START
 
 # what works
@@ -52,8 +51,13 @@ def test_render_by_one_file_of_cameras_which_serves_as_both_in_16_bits(cli):
     assert len(np.unique(pixels)) > 256
 
 
+def inria_model(config: str) -> Path:
+    cameras = [make_camera(eye, SIZE, name=name) for name, eye in zip("ab", EYES["train"], strict=False)]
+    return write_model(Path("model"), cameras, config, make_scene(100), 7, 30)
+
+
 def test_render_takes_an_inria_model_folder_as_it_is_and_a_scene_in_it_from_anywhere(cli, monkeypatch):
-    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
+    model = inria_model("white_background=True, resolution=2, images='images', eval=False")
     assert "background: white (from the camera files)" in cli.done(f"render -m {model} -o out --views all")[1]
     assert cv2.imread("out/a.png")[0, 0].min() > 200
     assert image_size(Path("out/a.png")) == (32, 24)  # cameras.json holds the source's size; training was at -r 2
@@ -190,24 +194,6 @@ def test_demo_does_the_whole_job(cli, monkeypatch):
     width, height = image_size(Path("shown/contact-sheet.png"))
     assert min(width, height) > 300
     cli.refused("demo -o shown")
-
-
-def inria_model(folder: Path, config: str) -> Path:
-    """A model folder as 3DGS writes it, with iterations 7 and 30."""
-    for iteration in (7, 30):
-        (folder / f"point_cloud/iteration_{iteration}").mkdir(parents=True)
-        write_scene(folder / f"point_cloud/iteration_{iteration}/point_cloud.ply", make_scene(100))
-    cameras = []
-    for i, (name, eye) in enumerate(zip("ab", EYES["train"], strict=False)):
-        camera = make_camera(eye, SIZE)
-        pose = torch.linalg.inv(camera.cam_from_world)
-        cameras.append(
-            {"id": i, "img_name": name, "width": SIZE[0], "height": SIZE[1], "position": pose[:3, 3].tolist(),
-             "rotation": pose[:3, :3].tolist(), "fx": camera.fx, "fy": camera.fy}
-        )  # fmt: skip
-    (folder / "cameras.json").write_text(json.dumps(cameras))
-    (folder / "cfg_args").write_text(config)
-    return folder
 
 
 @pytest.mark.parametrize(

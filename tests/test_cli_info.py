@@ -29,7 +29,7 @@ def test_info_with_cameras_tells_the_sampling_as_data_on_stdout_beside_a_log_on_
 
 
 def test_info_of_a_model_folder_tells_the_sampling_of_its_cameras(cli):
-    model = inria_model(Path("model"), "Namespace(eval=False)")
+    model = inria_model("eval=False")
     facts = info(model)
     assert facts["training_cameras"] == 2
     assert "training_rate" not in facts

@@ -10,8 +10,8 @@ import pytest
 
 from aaplug.io.scenes import SCENE_FORMATS
 from aaplug.methods.viewers import VIEWERS, Viewer
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "examples").rglob("*.md"))]
 ROWS = [
     line

@@ -21,9 +21,8 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.options.verbs import BUILT_IN_PATHS
-from tests.conftest import SAMPLE
+from tests.conftest import ROOT, SAMPLE, write_model
 
-ROOT = Path(__file__).resolve().parents[1]
 GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GAUSSIANS = 80
@@ -125,7 +124,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("path/to/colmap", "chair", "toy"):
         write_cameras(folder / name)
     for name in ("scene", "garden", "bicycle"):
-        write_model(folder / "output" / name, scene, folder / "chair")
+        write_photographed_model(folder / "output" / name, scene, folder / "chair")
     (folder / "camera_path.json").write_text(json.dumps(camera_path(folder / "chair")))
     for block in TABLES:
         name = re.match(r"# (\S+)\n", block.text)
@@ -151,25 +150,14 @@ def small(source: Path, target: Path) -> None:
         image.resize((SIZE, SIZE)).save(target)
 
 
-def write_model(folder: Path, scene: Gaussians, photographs: Path) -> None:
+def write_photographed_model(folder: Path, scene: Gaussians, photographs: Path) -> None:
     """An INRIA model folder with the test cameras and their photographs."""
-    (folder / "point_cloud" / "iteration_7").mkdir(parents=True)
-    write_scene(folder / "point_cloud" / "iteration_7" / "point_cloud.ply", scene)
     cameras = read_cameras(photographs)
-    entries = []
-    for number, camera in enumerate((*cameras.test, *cameras.train)):
-        rotation = camera.cam_from_world[:3, :3].T
-        entries.append(
-            {"id": number, "img_name": camera.name, "width": SIZE, "height": SIZE}
-            | {"position": camera.centre.tolist(), "rotation": rotation.tolist()}
-            | {"fx": camera.fx, "fy": camera.fy}
-        )
-    (folder / "cameras.json").write_text(json.dumps(entries))
+    arguments = "eval=True, images='images', resolution=1, white_background=True"
+    write_model(folder, (*cameras.test, *cameras.train), arguments, scene, 7)
     shutil.copytree(photographs / "test", folder / "images")
     for camera in cameras.train:
         shutil.copy(photographs / "test" / "r_8.png", folder / "images" / f"{camera.name}.png")
-    arguments = "eval=True, images='images', resolution=1, white_background=True"
-    (folder / "cfg_args").write_text(f"Namespace({arguments})")
 
 
 def camera_path(folder: Path) -> dict[str, object]:
