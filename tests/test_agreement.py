@@ -33,8 +33,8 @@ def fit_of(scene, cameras) -> Agreement:
 
 @pytest.fixture(scope="module")
 def few(sample_scene) -> Gaussians:
-    """Every tenth Gaussian of the sample."""
-    return sample_scene[::10]
+    """Every fourth Gaussian of the sample."""
+    return sample_scene[::4]
 
 
 def test_photographs_tell_a_scene_from_one_turned_over(few, sample_cameras):

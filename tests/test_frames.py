@@ -24,13 +24,18 @@ def paths(tmp_path):
     return [tmp_path / f"{view.name}.png" for view in VIEWS]
 
 
-def test_files_of_another_process_are_the_same(renderer, paths):
+def test_files_of_other_processes_are_the_same(renderer, paths, monkeypatch):
+    """Of two that are asked for one does the work: a start takes longest."""
     storage = Storage.of(Path("a.npz"), passes=("rgb", "alpha", "depth", "normal", "id"))
     files, progress, paths = [], [], [path.with_suffix(".npz") for path in paths]
-    for apply in (map, Processes(1).map):
-        how = {"storage": storage, "overwrite": apply is not map, "tell": lambda *now: progress.append(now)}
+    asked = []
+    monkeypatch.setattr("aaplug.system.executors.Processes", lambda count: asked.append(count) or Processes(1))
+    for threads in (1, 2):
+        apply = ProcessesIfLong(threads, pays_after=0.0).map
+        how = {"storage": storage, "overwrite": threads == 2, "tell": lambda *now: progress.append(now)}
         write_frames(renderer, VIEWS, paths, apply, **how)
         files.append([path.read_bytes() for path in paths])
+    assert asked == [2]
     assert files[0] == files[1]
     assert len(set(files[0])) == len(VIEWS)
     assert progress == 2 * [(done, 4) for done in range(5)]
