@@ -151,15 +151,6 @@ def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local)
     assert next(items) <= 6
 
 
-def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_path, monkeypatch):
-    assert list(local.map(partial(deadly_once, tmp_path / "died"), range(4))) == [0, 1, 4, 9]
-    [said] = local.monitor.said
-    assert re.fullmatch(r"lost 1 of 1 worker \(tcp://127.0.0.1:\d+\); others do again what was begun there", said)
-    monkeypatch.setattr(local.client.cluster.scheduler, "allowed_failures", 0)
-    with pytest.raises(UsageError, match=r"worker tcp://\S+: died 1 times at one item: out of memory"):
-        list(local.map(os._exit, [3]))
-
-
 def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
     local.client.wait_for_workers(1)  # another test may have killed it
     monkeypatch.setitem(cluster.VERSIONS, "aaplug", "9.9")
@@ -179,6 +170,15 @@ def test_a_cluster_without_workers_is_lost_after_a_while(local, monkeypatch):
     monkeypatch.setattr(cluster, "ABSENT_SECONDS", -1.0)
     with pytest.raises(UsageError, match="scheduler local: has had no workers for"):
         list(local.map(refuse_three, [1]))
+
+
+def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_path, monkeypatch):
+    assert list(local.map(partial(deadly_once, tmp_path / "died"), range(4))) == [0, 1, 4, 9]
+    said = local.monitor.said[-1]
+    assert re.fullmatch(r"lost 1 of 1 worker \(tcp://127.0.0.1:\d+\); others do again what was begun there", said)
+    monkeypatch.setattr(local.client.cluster.scheduler, "allowed_failures", 0)
+    with pytest.raises(UsageError, match=r"worker tcp://\S+: died 1 times at one item: out of memory"):
+        list(local.map(os._exit, [3]))
 
 
 def test_a_worker_that_does_not_see_the_folder_is_named(monkeypatch, tmp_path):
