@@ -120,13 +120,13 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         assert timeless(Path("out")) == whole
 
 
-def test_scenes_are_converted_to_the_same_bytes(cli):
+def test_scenes_are_converted_to_the_same_bytes(local, cli):
     Path("many.toml").write_text(
         "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
         "cameras = '.'\nvariance = 0.1\n"
     )
     cli.done("convert --batch many.toml -o here")
-    cli.done("convert --batch many.toml -o there --scheduler local --threads 1")
+    cli.done(f"convert --batch many.toml -o there --scheduler {local.client.scheduler.address}")
     for name in ("scene.ply", "b.ply"):
         assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
 

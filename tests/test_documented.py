@@ -36,6 +36,7 @@ SHORTER = {  # options that make a documented command quicker; they come last, s
     "bench": ["--repeats", "1", "--gaussians", "100"],
 }
 FITTING = ["--steps", "2"]  # of `convert --for`, likewise
+ONE_WORKER = ["--threads", "1"]  # of `--scheduler local`
 NERFBASELINES = (
     "nerfbaselines train --method aaplug --data chair --output run"
     " --set scene=$PWD/chair.ply --backend python --disable-output-artifact",
@@ -56,7 +57,6 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
     ),
     **dict.fromkeys(
         (
-            "aaplug evaluate a.ply b.ply --cameras path/to/colmap -o results --scheduler local --threads 2",
             "aaplug convert --batch scenes.toml -o converted --scheduler local --threads 2",
             "dask scheduler",
             "dask worker tcp://host:8786 --nworkers 16 --nthreads 1 --memory-limit 0",
@@ -193,6 +193,7 @@ def test_documented_commands_run(block, here, capsys):
         program, verb, *words = shlex.split(re.sub(r"--resolution \d+x\d+", "--resolution 64x36", line))
         assert program == "aaplug", f"{line}: run this too, or say in ELSEWHERE who does"
         shorter = FITTING if verb == "convert" and "--for" in words else SHORTER.get(verb, [])
+        shorter = ONE_WORKER if "local" in words else shorter
         if verb == "video" and "--path" in words and words[words.index("--path") + 1] not in BUILT_IN_PATHS:
             shorter = []  # a file says itself how long it is
         with pytest.raises(SystemExit) as stop:
