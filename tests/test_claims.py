@@ -29,14 +29,8 @@ OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
 
 @pytest.fixture
 def job(cli, plots_drawn_once):
-    """Run a verb; gives exit code and error."""
     Path("scenes.toml").write_text('[[scene]]\nscene = "scene.ply"\n')
-
-    def run(words: str) -> tuple[int, str]:
-        code, _, err = cli(words)
-        return code, err
-
-    return run
+    return cli
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
@@ -45,7 +39,7 @@ def test_a_second_process_is_refused(name, job):
     if file:
         Path(output).mkdir()
     with claimed(output):
-        code, err = job(f"{words} --overwrite")
+        code, _, err = job(f"{words} --overwrite")
     assert code == 2
     assert f"{output}: is being written by another process" in err.splitlines()[-1]
     assert list(Path().glob(f"{output}/*")) == []
@@ -63,7 +57,7 @@ def test_what_another_process_wrote_meanwhile_is_not_replaced(name, job, monkeyp
             yield
 
     monkeypatch.setattr(atomic, "new_file", after_a_rival)
-    code, err = job(words)
+    code, _, err = job(words)
     assert (code, written.read_bytes()) == (2, b"rival's")
     assert "exists" in err or "already holds" in err
     assert not any(word in err for word in ("tuning for", "rendering:", "---"))
@@ -84,7 +78,7 @@ def test_no_input_is_replaced_whatever_overwrite_says(name, job):
         before, old = source.read_bytes(), path.read_bytes()
         path.unlink()
         link(source, path)
-        code, err = job(f"{words} --overwrite")
+        code, _, err = job(f"{words} --overwrite")
         assert (code > 0, source.read_bytes() == before, path.samefile(source)) == (True, True, True), path
         assert f"is also the input {source}" in " ".join(err.split()), path
         path.unlink()
@@ -99,6 +93,6 @@ def test_photographs_that_the_chosen_cameras_do_not_name_are_inputs_too(job):
             shutil.copytree("test", folder)
         before = Path(folder, "r_0.png").read_bytes()
         file = "images.json" if "images" in folder else cameras
-        code, err = job(f"render scene.ply --cameras {file} -o {folder} --overwrite")
+        code, _, err = job(f"render scene.ply --cameras {file} -o {folder} --overwrite")
         assert (code, Path(folder, "r_0.png").read_bytes()) == (2, before)
         assert "is also the input" in err

@@ -24,6 +24,7 @@ from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.system.executors import load, save
 from tests.conftest import EYES, make_scene
 from tests.scene_files import DATA
+from tests.test_batch import killed_at
 
 WORDS = "--cameras . --rasterizer eager --views train --scale 0.5 1 2"
 QUICK = "--cameras . --rasterizer eager --scale 0.5 --metric psnr"
@@ -248,16 +249,8 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
-    real, added = Journal.add, []
-
-    def stopping(self, view, measurements):
-        if len(added) == 2:
-            raise KeyboardInterrupt
-        added.append(view)
-        real(self, view, measurements)
-
     with monkeypatch.context() as patch:
-        patch.setattr(Journal, "add", stopping)
+        patch.setattr(Journal, "add", killed_at(2))
         assert cli(words)[0] == 130
     assert "resume" in cli(words)[2]
     cli.done(f"{words} --resume")

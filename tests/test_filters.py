@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from aaplug.core.projection import project, rotation_matrices
-from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import ADAPTIVE_VARIANCE, LEAST_SHARE, Adaptive, AnisotropicSmoothing
 from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
@@ -17,7 +16,7 @@ from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D
 from aaplug.methods.presets import suited
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
-from tests.conftest import make_camera, make_scene, make_splats, sized
+from tests.conftest import make_camera, make_scene, make_splats, sized, splats_of
 
 F64 = torch.float64
 WIDE = make_scene(60, dtype=F64)
@@ -117,16 +116,7 @@ def test_balanced_opacity_follows_the_broadest_face_down_to_its_floor(thickness,
     assert (balanced.opacities / scene.opacities).item() == pytest.approx(expected, rel=1e-6)
 
 
-def row_of_splats(covs: list[tuple[float, float, float]]) -> Splats2D:
-    """Opaque splats of these covariances, whose size is √(2 ln 255) = 3.33 times a cross-section."""
-    packed = torch.tensor(covs, dtype=F64)
-    xx, xy, yy = packed.unbind(dim=1)
-    n = len(covs)
-    zeros, ones = torch.zeros(n, 2, dtype=F64), torch.ones(n, dtype=F64)
-    return Splats2D(zeros, packed, xx * yy - xy * xy, ones, ones, torch.arange(n))
-
-
-CUTOFF = math.sqrt(2 * math.log(255))
+CUTOFF = math.sqrt(2 * math.log(255))  # size of an opaque splat over a cross-section
 
 
 def test_pixel_sizes_are_those_of_the_published_form():
@@ -160,7 +150,7 @@ def test_pixel_sizes_are_those_of_the_published_form():
 )
 def test_multi_scale_draws_gaussians_at_the_sizes_of_training(size, smallest, largest, base, drawn):
     variance = (size / CUTOFF) ** 2
-    splats = row_of_splats([(variance, 0.0, variance)] * 2)
+    splats = splats_of(*[((0.0, 0.0), (variance, 0.0, variance), 1.0, 1.0, (1.0, 1.0, 1.0))] * 2)
     always = PixelSizes(torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True]))
     chosen = ByPixelSize()(splats, replace(make_scene(2), extras=always.extras))
     assert chosen.sources.tolist() == [0, 1][not drawn :]

@@ -10,7 +10,7 @@ import torch
 
 from aaplug.core.splats import Render, Splats2D
 from aaplug.methods.pixel_kernels.point import POINT
-from tests.conftest import ALL_RASTERIZERS, make_splats
+from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
@@ -45,16 +45,8 @@ def one(
     opacity: float = 0.5,
     det: float | None = None,
 ) -> Splats2D:
-    xx, xy, yy = covariance
-    return Splats2D(
-        means=torch.tensor([mean]),
-        covs=torch.tensor([covariance]),
-        dets=torch.tensor([xx * yy - xy * xy if det is None else det]),
-        depths=torch.tensor([1.0]),
-        opacities=torch.tensor([opacity]),
-        sources=torch.tensor([0]),
-        rgb=torch.tensor([[1.0, 0.5, 0.25]]),
-    )
+    splat = splats_of((mean, covariance, 1.0, opacity, (1.0, 0.5, 0.25))).to(torch.float32)
+    return splat if det is None else replace(splat, dets=torch.tensor([det]))
 
 
 def assert_same(image: Render, other: Render, atol: float = SAME) -> None:
