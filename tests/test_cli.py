@@ -1,7 +1,6 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ from plyfile import PlyData
 
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
-from tests.conftest import EYES, SIZE, make_camera, make_scene, write_model
+from tests.conftest import EYES, SIZE, make_camera, make_scene, run_python, write_model
 from tests.test_startup import START
 
 # what works
@@ -213,7 +212,7 @@ def test_a_reader_that_leaves_early_is_no_failure(entry, words):
 @pytest.mark.parametrize(("closed", "words", "code"), [(1, "viewers", 0), (2, "viewers", 0), (2, "render", 2)])
 def test_a_stream_that_the_caller_closed_is_written_nowhere(closed, words, code):
     program = f"import os; os.close({closed}); os.execv({sys.executable!r}, ['python', '-c', {START!r}, {words!r}])"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    run = run_python(program)
     assert (run.returncode, "Traceback" in run.stderr, bool(run.stdout)) == (code, False, (closed, code) == (2, 0))
 
 
@@ -221,15 +220,14 @@ def test_a_stream_that_the_caller_closed_is_written_nowhere(closed, words, code)
 def test_a_folder_that_matplotlib_makes_where_home_is_read_only_goes(tmp_path, given):
     change = f"main.main = lambda: (os.environ.update(MPLCONFIGDIR={str(tmp_path)!r}), sys.exit())"
     program = f"import os, sys; from aaplug_cli import main; {change}; main.program()"
-    environment = os.environ | ({"MPLCONFIGDIR": str(tmp_path)} if given else {})
-    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+    assert run_python(program, **({"MPLCONFIGDIR": tmp_path} if given else {})).returncode == 0
     assert tmp_path.exists() == given
 
 
 @pytest.mark.parametrize(("words", "code"), [(["viewers", "--json"], 0), (["info"], 2)])
 def test_the_program_ends_at_once_with_all_said(words, code):
     program = "import atexit; atexit.register(print, 'late'); from aaplug_cli.main import program; program()"
-    run = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
+    run = run_python(program, *words)
     assert run.returncode == code
     assert bool(run.stdout) == (code == 0)
     assert "late" not in run.stdout

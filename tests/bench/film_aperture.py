@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 
@@ -58,7 +58,8 @@ def aperture(
                 of = exposure(renderer, view, size)
                 truth = renderer(of(TRUTH)).rgb
                 images = {str(n): renderer(of(n)).rgb for n in (1, 5, 16)}
-                with without_cells():
+                # samples stand for points, as plain supersampling's do
+                with patch.object(rendering, "cells", lambda splats, _: torch.zeros_like(splats.covs)):
                     images["16 plain"] = renderer(of(16)).rgb
                 images["pinhole"] = renderer(view).rgb
                 works = {"one": partial(renderer, of(16)), "separate": partial(_separate, renderer, of(16))}
@@ -96,17 +97,6 @@ def _motion(renderer: Renderer, view: Camera, length: float) -> Callable[[int], 
 
     turn = 1e-3 * length / moved(1e-3)
     return lambda samples: replace(view, exposure=Exposure(None, ends(turn), samples))
-
-
-@contextmanager
-def without_cells():
-    """Inside, samples stand for points, as plain supersampling's do."""
-    cells = rendering.cells
-    rendering.cells = lambda splats, _: torch.zeros_like(splats.covs)
-    try:
-        yield
-    finally:
-        rendering.cells = cells
 
 
 def _separate(renderer: Renderer, view: Camera) -> None:
