@@ -217,6 +217,7 @@ def test_what_contradicts_itself_is_refused(tmp_path):
 
 
 def test_a_stale_picture_is_not_judged(tmp_path):
-    aaplug.conform(lambda scene, camera, image: write_png(image, torch.zeros(64, 64, 3)), output=tmp_path / "kit")
+    how = {"viewer": "classic", "output": tmp_path / "kit"}
+    aaplug.conform(lambda scene, camera, image: write_png(image, torch.zeros(64, 64, 3)), **how)
     with pytest.raises(UsageError, match=r"none of 10 pictures: there is no dilation\.png"):
-        aaplug.conform(lambda *paths: None, output=tmp_path / "kit", overwrite=True)
+        aaplug.conform(lambda *paths: None, **how, overwrite=True)
