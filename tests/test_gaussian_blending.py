@@ -24,14 +24,12 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.system.executors import torch_threads
 from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of
 
 F64 = torch.float64
 NODES = 20_001
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 BLENDING = GaussianBlending()
-TILED = {name: rasterizer for name, rasterizer in ALL_RASTERIZERS.items() if name != "reference"}
 WIDE = (1e4, 0.0, 1e4)  # px²: of a splat that is even over a pixel
 
 
@@ -146,16 +144,3 @@ def test_extreme_splats_agree_with_the_reference_among_others(rasterizer, name):
         difference = (image.rgb - exact.rgb).abs().amax(dim=2)
         assert difference.isfinite().all()
         assert (difference > 2e-5).double().mean() < 2e-3
-
-
-@pytest.mark.parametrize("rasterizer", TILED.values(), ids=TILED)
-def test_every_number_of_threads_gives_the_same_bits(rasterizer):
-    hw = (120, 150)
-    splats = make_splats(2000, hw, seed=6)
-
-    def drawn(threads: int) -> Tensor:
-        with torch_threads(threads):
-            return rasterizer(splats, hw, BLACK, INTEGRAL, BLENDING).rgb
-
-    one = drawn(1)
-    assert all(drawn(threads).equal(one) for threads in (2, 3))

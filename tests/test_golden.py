@@ -211,7 +211,7 @@ def test_images_are_those_of_gsplat(degree, compensated):
     agree(scene, camera, "ewa" if compensated else "classic", golden)
 
 
-@pytest.mark.parametrize(("seed", "degree"), [(4, 0), (5, 1), (6, 2), (7, 3)])
+@pytest.mark.parametrize(("seed", "degree"), [(4, 0), (7, 3)])
 def test_images_are_those_of_3dgs(seed, degree):
     camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
     scene = scene_of(seed, degree)

@@ -16,11 +16,11 @@ from tests.hostile import check
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
 TARGETS = {**scenes(), **cameras(), **paths(), **others()}
-FILES = 50  # of each reader
-USD_FILES = 5  # each is read in a process of its own
+FILES = 30  # of each reader
+USD_FILES = 4  # each is read in a process of its own
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", [name for name in TARGETS if name != "scene of usd"])  # it is read as .usdc is
 def test_damage_does_no_harm(name: str):
     files = USD_FILES if name.startswith("scene of usd") else FILES
     assert damaged(name, TARGETS[name], files, seed=0)["refused"] > 0

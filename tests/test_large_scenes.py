@@ -97,7 +97,7 @@ def test_gaussians_that_were_read_anyway_are_drawn(tmp_path: Path, monkeypatch: 
 
 def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_folder: Path):
     def images(folder: str) -> list[torch.Tensor]:
-        chair, one = sample_folder / "chair.ply", {"views": "test", "scale": 1 / 8, "threads": 1}
+        chair, one = sample_folder / "chair.ply", {"views": "r_8", "scale": 1 / 16, "threads": 1}
         return [read_image(file) for _, file in render(chair, sample_folder, tmp_path / folder, **one)]
 
     expected = images("held")

@@ -22,10 +22,10 @@ DEPTH = 4.0
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory):
     """A scene and two views with photographs, which the scene itself made."""
-    scene, folder = make_scene(400, seed=3), tmp_path_factory.mktemp("photographs")
+    scene, folder = make_scene(200, seed=3), tmp_path_factory.mktemp("photographs")
     views = []
     for i, eye in enumerate([(0.5, -4.0, 0.4), (2.6, -3.0, 1.0)]):
-        view = make_camera(eye, size=(160, 120), name=f"view{i}")
+        view = make_camera(eye, size=(128, 96), name=f"view{i}")
         write_png(folder / f"{i}.png", Renderer.of(scene, [view], min_seen=0.0)(view).rgb.clamp(0, 1))
         views.append(replace(view, photo=folder / f"{i}.png"))
     return scene, CameraSet(tuple(views), tuple(views))

@@ -1,4 +1,4 @@
-"""Projection against finite differences, and its precision; orthonormal harmonics.  test_golden.py has the formulas."""
+"""The precision of projection, and orthonormal harmonics.  test_golden.py has the formulas."""
 
 import math
 from dataclasses import replace
@@ -15,10 +15,6 @@ from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, straight_camera
 
 F64 = torch.float64
-
-
-def packed(covariance: torch.Tensor) -> torch.Tensor:
-    return torch.stack([covariance[0, 0], covariance[0, 1], covariance[1, 1]])
 
 
 def world_covariance(scene: Gaussians) -> torch.Tensor:
@@ -44,30 +40,6 @@ def test_the_near_plane_itself_is_not_drawn(dtype):
 def test_a_scene_behind_the_camera_has_no_splats():
     scene, camera = replace(make_scene(1), means=torch.tensor([[0.0, 0.0, -1.0]])), straight_camera()
     assert shade(project(scene, camera), scene, camera).rgb.shape == (0, 3)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_off_axis_covariances_follow_the_derivative_of_the_pinhole(seed):
-    camera = replace(make_camera((2.0, -3.0, 1.0)), fy=50.0, cx=20.0, cy=31.0)
-    scene = make_scene(1, seed=seed, dtype=F64)
-    scene = replace(scene, means=scene.means * 0.5)
-    pose = camera.cam_from_world
-
-    def pixel(point: torch.Tensor) -> torch.Tensor:
-        x, y, z = pose[:3, :3] @ point + pose[:3, 3]
-        return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-
-    step = 1e-5 * torch.eye(3, dtype=F64)
-    mean = scene.means[0]
-    columns = [(pixel(mean + d) - pixel(mean - d)) / 2e-5 for d in step]
-    jacobian = torch.stack(columns, dim=1)
-    expected = jacobian @ world_covariance(scene) @ jacobian.T
-    splats = project(scene, camera)
-    assert 0 < splats.means[0, 0] < camera.width
-    assert 0 < splats.means[0, 1] < camera.height
-    torch.testing.assert_close(splats.means[0], pixel(mean))
-    torch.testing.assert_close(splats.covs[0], packed(expected), rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(splats.dets[0], torch.linalg.det(expected), rtol=1e-7, atol=0)
 
 
 def needles(n: int, long: float, thin: float) -> Gaussians:
@@ -134,7 +106,7 @@ def test_scaling_a_camera_scales_means_and_covariances(factor):
 PI = math.pi
 
 
-def basis(directions: torch.Tensor, functions: int = 16) -> torch.Tensor:
+def basis(directions: torch.Tensor, functions: int = 25) -> torch.Tensor:
     """Value of each function in each direction, from the colour of scenes with that function only."""
     m = len(directions)
     columns = []
@@ -152,15 +124,9 @@ def test_spherical_harmonics_are_orthonormal():
     z, angle = torch.cartesian_prod(z, around).T
     weights = weights.repeat_interleave(10) * PI / 5
     radius = (1 - z * z).sqrt()
-    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1), 25)
+    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
     gram = values.T @ (weights[:, None] * values)
     torch.testing.assert_close(gram, torch.eye(25, dtype=F64), atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize("functions", [1, 4, 9, 16])
-def test_a_lower_degree_is_a_prefix_of_a_higher_one(functions):
-    directions = torch.nn.functional.normalize(make_scene(10, dtype=F64).means, dim=1)
-    torch.testing.assert_close(basis(directions, functions), basis(directions, 25)[:, :functions])
 
 
 def test_orders_m_and_minus_m_are_rotations_of_one_function():
@@ -170,14 +136,14 @@ def test_orders_m_and_minus_m_are_rotations_of_one_function():
 
     def at(angle: float) -> torch.Tensor:
         a = torch.tensor([angle], dtype=F64)
-        return basis(torch.stack([r * a.cos(), r * a.sin(), z], dim=1), 25)[0]
+        return basis(torch.stack([r * a.cos(), r * a.sin(), z], dim=1))[0]
 
     for degree in (2, 3, 4):
         for m in range(1, degree + 1):
             middle = degree * degree + degree
             quarter = at(0.4 + PI / (2 * m))  # sin becomes cos there
             torch.testing.assert_close(quarter[middle - m], at(0.4)[middle + m])
-        pole = basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), 25)[0]
+        pole = basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))[0]
         assert pole[middle] == pytest.approx(((2 * degree + 1) / (4 * PI)) ** 0.5)
 
 
@@ -191,21 +157,6 @@ def test_shading_in_chunks_gives_the_same_colours(monkeypatch):
     parts = shade(splats, replace(scene, sh=sh), camera).rgb
     assert parts.equal(whole)
     assert torch.autograd.grad(parts.square().sum(), [sh])[0].equal(gradient)
-
-
-def test_gradients_of_colours_reach_only_the_gaussians_drawn():
-    scene, camera = make_scene(50, degree=2), make_camera()
-    splats = project(scene, camera)
-    some = splats[torch.arange(0, len(splats.sources), 3)]
-    sh = scene.sh.clone().requires_grad_()
-    shade(some, replace(scene, sh=sh), camera).rgb.sum().backward()
-    touched = sh.grad.abs().amax(dim=(1, 2)) > 0
-    shown = torch.zeros(50, dtype=torch.bool)
-    shown[some.sources] = True
-    assert touched.any()
-    assert not (touched & ~shown).any()
-    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is clamped at black
-    assert constant.amax().item() == pytest.approx(0.28209479177387814)
 
 
 def test_ray_slopes_are_those_of_the_mean_depth_behind_a_pixel():

@@ -3,7 +3,6 @@
 import ast
 import copy
 import itertools
-import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -131,12 +130,6 @@ def test_quality_is_that_of_auto(cameras):
     assert Renderer.of(scene, cameras, "matched", quality="best").recipe.target_rate == 0
 
 
-def test_a_renderer_can_be_sent_to_another_process(cameras):
-    renderer = Renderer.of(make_scene(50), cameras, rasterizer="eager")
-    again = pickle.loads(pickle.dumps(renderer))
-    assert again(cameras[0]).rgb.equal(renderer(cameras[0]).rgb)
-
-
 @pytest.mark.parametrize("recipe", ["auto", "2dgs", "analytic"])
 def test_autocast_changes_nothing(recipe, cameras):
     renderer = Renderer.of(make_scene(30), cameras, recipe)
@@ -210,13 +203,6 @@ def test_a_drawing_holds_the_splats_of_the_image_that_has_the_samples(cameras):
     assert drawing.splats.means.equal(renderer.splats(fine).means)
 
 
-def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
-    renderer = Renderer.of(make_scene(200), cameras, rasterizer="eager")
-    whole = renderer(cameras[0]).rgb
-    monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 33)
-    torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
-
-
 def test_a_renderer_of_a_scene_with_gradients_has_them_where_the_filter_follows_the_training_views(cameras):
     scene = make_scene(200)
     scene = replace(scene, means=scene.means.requires_grad_())
@@ -231,10 +217,10 @@ def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras
     renderer, seen = Renderer.of(scene, cameras, rasterizer="eager"), []
     monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 33)
     monkeypatch.setattr(rendering, "project", lambda part, *rest: seen.append(len(part)) or project(part, *rest))
-    renderer(cameras[0])
+    whole = renderer(cameras[0]).rgb
     assert seen == [200]
     with torch.no_grad():
-        renderer(cameras[0])
+        torch.testing.assert_close(renderer(cameras[0]).rgb, whole.detach(), rtol=0, atol=1e-6)
     assert seen[1:] == [33, 33, 33, 33, 33, 33, 2]
 
 

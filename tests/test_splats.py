@@ -63,25 +63,12 @@ def test_compensation_has_a_floor():
     assert speck.blurred(0.3, True, floor=0.0).opacities.item() == pytest.approx(1e-3 / 0.301)
 
 
-def test_blurring_adds_its_variance_to_the_diagonal_only():
-    blurred = splat(1.0, 0.3, 0.5, opacity=0.7).blurred(0.25, compensate=False)
-    torch.testing.assert_close(blurred.covs, torch.tensor([[1.25, 0.3, 0.75]], dtype=F64))
-    torch.testing.assert_close(blurred.dets, torch.tensor([1.25 * 0.75 - 0.09], dtype=F64))
-    assert blurred.opacities.item() == 0.7
-
-
 def test_blurring_takes_a_variance_for_each_splat():
     splats = make_splats(4, (32, 32)).to(F64)
     variances = torch.tensor([0.0, 0.1, 2.0, 30.0], dtype=F64)
     together = splats.blurred(variances, compensate=True)
     for i, variance in enumerate(variances.tolist()):
         same(together[i : i + 1], splats[i : i + 1].blurred(variance, compensate=True))
-
-
-@pytest.mark.parametrize("compensate", [False, True])
-def test_two_blurs_are_one_of_the_summed_variance(compensate):
-    splats = make_splats(50, (32, 32)).to(F64)
-    same(splats.blurred(0.2, compensate).blurred(0.5, compensate), splats.blurred(0.7, compensate))
 
 
 @pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])

@@ -24,14 +24,14 @@ from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 
 LEVELS = 2
-SCENE = make_scene(400)
+SCENE = make_scene(200)
 CAMERAS = aaplug.CameraSet(tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))), ())
 
 
 @pytest.fixture
 def small_leaves(monkeypatch):
-    monkeypatch.setattr(streamed, "LEAF_GAUSSIANS", 100)
-    monkeypatch.setattr("aaplug.verbs.lod.MAX_CHUNK_GAUSSIANS", 50)
+    monkeypatch.setattr(streamed, "LEAF_GAUSSIANS", 50)
+    monkeypatch.setattr("aaplug.verbs.lod.MAX_CHUNK_GAUSSIANS", 25)
 
 
 def made(folder, to, **how):
@@ -58,6 +58,9 @@ def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
     means = torch.cat([level.scene.means for level in levels])
     low, high = (torch.tensor(index["tree"]["bound"][end]) for end in ("min", "max"))
     torch.testing.assert_close(torch.stack([low, high]), torch.stack([means.amin(dim=0), means.amax(dim=0)]))
+    for resume, said in ((False, "already holds lod-meta"), (True, "out: is of a run that is complete: nothing is left")):
+        with pytest.raises(OutputError, match=said):
+            made(tmp_path / "out", "sog", resume=resume)
 
 
 def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves):
@@ -121,7 +124,8 @@ def test_a_rad_is_a_tree_of_the_levels(tmp_path, monkeypatch):
     """Spark draws the leaves nearby, and the coarsest level at its rate: it exchanges what is larger than a pixel."""
     monkeypatch.setattr(rad, "CHUNK_GAUSSIANS", 100)
     monkeypatch.setattr(rad, "MAX_CHILDREN", 99)
-    seen = SCENE[median_rates(SCENE.means, CAMERAS.train) > 0]
+    scene = make_scene(400)
+    seen = scene[median_rates(scene.means, CAMERAS.train) > 0]
     small = replace(seen, log_scales=seen.log_scales - 2)
     how = {"to": "rad", "levels": LEVELS, "refine": False, "min_seen": 0.0}
     aaplug.lod(small, CAMERAS, tmp_path, **how)
@@ -162,7 +166,7 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     def contents(folder):
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
-    tuned = {} if to == "3dtiles" else {"refine": True, "steps": 2}
+    tuned = {} if to == "3dtiles" else {"refine": True, "steps": 1}
     made(tmp_path / "whole", to, **tuned)
     writer, number_at = ("write_front", 1) if to == "rad" else ("write_level", 2)
     written, resumed, read, opened = getattr(streamed, writer), [], pyramid_folder.ply.open_scene, set()
@@ -190,16 +194,23 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
 
 
 @pytest.mark.parametrize("to", streamed.STREAMS)
-def test_nothing_is_left_of_a_longer_run_that_was_cut_short(tmp_path, monkeypatch, to):
-    written = streamed.write_index
+def test_nothing_is_left_of_a_longer_run_that_was_cut_short_and_parts_are_for_their_viewer(tmp_path, monkeypatch, to):
+    """Also without tuning."""
+    out, stream, written = tmp_path / "out", streamed.STREAMS[to], streamed.write_index
     monkeypatch.setattr("aaplug.io.streamed.write_index", lambda folder, *rest: written(tmp_path / "elsewhere", *rest))
     with pytest.raises(FormatError, match="no such file"):
-        made(tmp_path / "out", to)
-    assert (tmp_path / "out" / "lod.json").exists()
+        made(out, to)
+    assert (out / "lod.json").exists()
     monkeypatch.setattr("aaplug.io.streamed.write_index", written)
-    made(tmp_path / "out", to, levels=LEVELS - 1, overwrite=True)
-    names = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
-    assert names == {streamed.SETTINGS, streamed.STREAMS[to].index}
+    made(out, to, levels=LEVELS - 1, overwrite=True)
+    assert {path.name for path in out.iterdir() if path.is_file()} == {streamed.SETTINGS, stream.index}
+    assert {"sog": "sog", "3dtiles": "spz.glb", "rad": "ply"}[to] in VIEWERS[stream.viewer].formats
+    for folder in streamed.part_folders(out, to):
+        assert read_scene(folder / stream.content).convention == VIEWERS[stream.viewer].convention
+    if to != "sog":
+        for path in (out, out / stream.index):
+            with pytest.raises(FormatError, match=f"{stream.index}: holds levels for another viewer"):
+                read_scene(path)
 
 
 @pytest.mark.parametrize(("text", "said"), [("{}", "a list of parts"), ("[[1, 2]]", "7 numbers"), ("", "JSON")])
@@ -212,7 +223,7 @@ def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
 def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypatch):
     monkeypatch.setattr(rad, "MAX_CHILDREN", 5)
     generator = torch.Generator().manual_seed(0)
-    parents = torch.cat([torch.randint(380, 400, (380,), generator=generator), torch.full((20,), -1)])
+    parents = torch.cat([torch.randint(180, 200, (180,), generator=generator), torch.full((20,), -1)])
     tree = rad.tree_of(SCENE, parents)
     assert tree.counts.max() <= 5
     above = torch.full((len(tree.scene),), -1)
@@ -232,7 +243,7 @@ def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypat
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
     given = {
         "faint": replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20),
-        "large, of degree 4": replace(make_scene(400, degree=4), log_scales=SCENE.log_scales + 3),
+        "large, of degree 4": replace(make_scene(200, degree=4), log_scales=SCENE.log_scales + 3),
         "in float64": SCENE.to(torch.float64),
         "large, alone": replace(SCENE, log_scales=SCENE.log_scales + 3)[:1],
     }[scene]
@@ -258,19 +269,11 @@ def test_a_damaged_tree_is_refused(tmp_path):
     with pytest.raises(FormatError, match="to the 0 Gaussians"):
         streamed.read_front(tmp_path, 0)
     streamed.write_front(tmp_path, 0, front._replace(parents=torch.arange(len(SCENE)) - 1), 0)
-    with pytest.raises(FormatError, match=r"tree\.npz.*does not belong to the 400 Gaussians"):
+    with pytest.raises(FormatError, match=r"tree\.npz.*does not belong to the 200 Gaussians"):
         streamed.read_front(tmp_path, 0)
     (tmp_path / "0_0" / streamed.TREE).write_bytes(b"PK")
     with pytest.raises(FormatError, match=r"tree\.npz.*is damaged"):
         streamed.write_index(tmp_path, "rad", 1, 1.0, frame_of(SCENE))
-
-
-def test_levels_that_are_there_are_not_replaced(tmp_path):
-    made(tmp_path / "out", "sog")
-    with pytest.raises(OutputError, match="already holds lod-meta"):
-        made(tmp_path / "out", "sog")
-    with pytest.raises(OutputError, match="out: is of a run that is complete: nothing is left to resume"):
-        made(tmp_path / "out", "sog", resume=True)
 
 
 def test_fronts_are_removed_and_nothing_else(tmp_path):
@@ -296,18 +299,6 @@ def test_parts_of_an_earlier_run_are_removed_and_nothing_else(tmp_path, small_le
     assert len(few) == LEVELS + 1 < len(many)
     assert set((tmp_path / "out").glob("*_*")) == few | {mine.parent}
     assert list(mine.parent.iterdir()) == [mine]
-
-
-@pytest.mark.parametrize(("to", "viewer"), [(to, stream.viewer) for to, stream in streamed.STREAMS.items()])
-def test_parts_are_for_their_viewer_also_without_tuning(tmp_path, to, viewer):
-    assert {"sog": "sog", "3dtiles": "spz.glb", "rad": "ply"}[to] in VIEWERS[viewer].formats
-    made(tmp_path / "out", to)
-    for folder in streamed.part_folders(tmp_path / "out", to):
-        assert read_scene(folder / streamed.STREAMS[to].content).convention == VIEWERS[viewer].convention
-    if to != "sog":
-        for path in (tmp_path / "out", tmp_path / "out" / streamed.STREAMS[to].index):
-            with pytest.raises(FormatError, match=f"{streamed.STREAMS[to].index}: holds levels for another viewer"):
-                read_scene(path)
 
 
 def test_a_page_has_the_viewer_beside_it(tmp_path):
