@@ -133,14 +133,9 @@ def test_a_transparent_exr_over_the_background_is_the_opaque_image_where_colours
     assert (levels(over, 8) - levels(opaque, 8)).abs().max() <= 1
 
 
-def light_of(value: float) -> float:
-    """IEC 61966-2-1, by its definition."""
-    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
-
-
 def test_linear_colours_are_decoded_once_from_straight_ones():
     values = torch.tensor([0.0, 0.02, 0.04045, 0.0405, 0.2, 0.5, 1.0, 1.3])
-    expected = torch.tensor([light_of(value) for value in values.tolist()])
+    expected = torch.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     assert torch.allclose(linear(values[:, None].expand(-1, 3))[:, 0], expected, rtol=1e-6)
 
 

@@ -262,14 +262,9 @@ def test_a_pixel_of_a_plane_has_the_area_of_the_images_own(lens):
     assert splats.rates is not None
     means, pose = scene.means[splats.sources], camera.cam_from_world
     local = (means - camera.centre) @ pose[:3, :3].T
-    sight = (
-        torch.nn.functional.normalize(local, dim=1)
-        if lens != ORTHO
-        else torch.tensor([0.0, 0.0, 1.0]).to(local).expand_as(local)
-    )
-    a = torch.nn.functional.normalize(
-        torch.linalg.cross(sight, torch.tensor([0.3, 0.5, 0.1]).to(local).expand_as(local)), dim=1
-    )
+    unit, ahead, slanted = torch.nn.functional.normalize, *torch.tensor([[0.0, 0.0, 1.0], [0.3, 0.5, 0.1]]).to(local)
+    sight = ahead.expand_as(local) if lens == ORTHO else unit(local, dim=1)
+    a = unit(torch.linalg.cross(sight, slanted.expand_as(local)), dim=1)
     b = torch.linalg.cross(sight, a)
     places = [camera.pixels(lens.places(local + 1e-6 * step)) - camera.pixels(lens.places(local)) for step in (a, b)]
     area = (places[0][:, 0] * places[1][:, 1] - places[0][:, 1] * places[1][:, 0]).abs()

@@ -74,7 +74,7 @@ def test_poses_that_are_off_come_back_and_right_ones_stay(photographed):
 def test_coarse_scales_lead_farther_than_fine_ones(photographed):
     scene, cameras = photographed
     renderer = Renderer.of(scene, cameras, min_seen=0.0)
-    off = moved_by(cameras.train[0], 6 * CHANGE, DEPTH)
+    off = moved_by(cameras.train[0], 14 * CHANGE, DEPTH)
     coarse_to_fine, fine = (refine_pose(renderer, off, scales).camera for scales in ((1 / 8, 1 / 4, 1 / 2), (1 / 2,)))
     assert apart(coarse_to_fine, cameras.train[0])[0] < apart(fine, cameras.train[0])[0] / 2
 

@@ -188,16 +188,6 @@ def test_few_pixels_flip_at_a_cutoff():
     assert (differences > TOLERANCE).double().mean() < FLIPS
 
 
-def test_needles_rounded_to_float32_are_accurate():
-    hw = (64, 64)
-    exact = needles(60, hw, 0, 200.0, 0.6)
-    for name, rasterize in ALL_RASTERIZERS.items():
-        image = rasterize(exact.to(torch.float32), hw, WHITE, POINT)
-        difference = (image.rgb - REFERENCE(exact, hw, WHITE).rgb).abs().amax(dim=2)
-        worst = difference[~near_a_cutoff(exact, hw)].max().item()
-        assert worst < TOLERANCE, f"{name} is {worst:.1e} off"
-
-
 def test_an_image_of_one_tile_has_as_many_tiles_as_compiled_kernels_take(monkeypatch):
     grids = []
     monkeypatch.setattr(rasterizer, "bands", lambda *args: grids.append(args[1]) or binning.bands(*args))

@@ -90,20 +90,17 @@ def test_auto_draws_discs_for_a_scene_of_2d_gaussians_only(cameras):
     assert best.samples_at(0.25) == 4
 
 
-def test_cameras_of_another_scene_are_refused(cameras):
+def test_cameras_of_another_scene_and_none_are_refused(cameras):
     scene = make_scene(200)
     elsewhere = replace(scene, means=scene.means + 100)
     with pytest.raises(FrameError, match="different frames"):
         Renderer.of(elsewhere, cameras)
     with pytest.raises(FrameError, match=r"0\.0%"):
         Renderer.of(elsewhere, cameras, min_seen=1e-6)
+    with pytest.raises(UsageError, match="cameras: there are none"):
+        Renderer.of(scene, [])
     training = TrainingViews.of(elsewhere, cameras)  # whoever computes it has checked it
     assert Renderer.of(elsewhere, training, "classic", rasterizer="eager").training is training
-
-
-def test_no_cameras_are_refused():
-    with pytest.raises(UsageError, match="cameras: there are none"):
-        Renderer.of(make_scene(3), [])
 
 
 def test_a_camera_set_gives_its_training_cameras_and_its_background(cameras):

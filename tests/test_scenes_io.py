@@ -511,12 +511,8 @@ def test_a_nerfstudio_export_is_what_its_config_says_or_asks(tmp_path: Path, con
     (tmp_path / "elsewhere").mkdir()
     write_scene(tmp_path / "elsewhere" / "out.ply", opened.gaussians())
     assert read_scene(tmp_path / "elsewhere" / "out.ply").convention == convention
-
-
-@pytest.mark.parametrize("comment", ["SplatRenderMode: default", "aaplug convention=classic"])
-def test_a_tag_is_stronger_than_a_config(tmp_path: Path, comment: str):
-    (tmp_path / "config.yml").write_text(CONFIG.format("antialiased"))
-    assert read_scene(plain(*NERFSTUDIO, comment).save(tmp_path)).convention == CLASSIC
+    for tag in ("SplatRenderMode: default", "aaplug convention=classic"):  # is stronger
+        assert read_scene(plain(*NERFSTUDIO, tag).save(tmp_path)).convention == CLASSIC
 
 
 @pytest.mark.parametrize("folder", ["ply", "elsewhere"])

@@ -55,11 +55,9 @@ def test_links_to_papers_say_what_they_lead_to():
             assert said == led, path.name
 
 
-def test_the_short_table_is_made_from_the_csv():
+def test_tables_and_claims_are_made_from_the_result_files_to_the_digit():
     assert short_table() in METHODS
-
-
-def test_the_page_of_claims_is_made_from_the_result_files_to_the_digit():
+    assert shown_table() in (GUIDES / "viewers.md").read_text()
     assert PAGE_OF_CLAIMS.read_text() == claims_page()
     assert len(CLAIMS) >= 20
 
@@ -100,10 +98,6 @@ def test_each_plot_is_asked_for_once_and_names_its_files_their_command_and_commi
         assert re.search(
             r"tables/\w+\.csv.*<code>.*tests\.bench \w+.*</code> made at commit [0-9a-f]{12}", figure, re.S
         )
-
-
-def test_the_table_of_viewers_is_made_from_its_result_file():
-    assert shown_table() in (GUIDES / "viewers.md").read_text()
 
 
 def test_pictures_are_small_and_each_is_shown():

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from aaplug.core.kernels import EAGER, Kernels
-from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE, next_rows
+from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers.reference import Reference
-from aaplug.rasterizers.tiled import Tiled, forward, layout
+from aaplug.rasterizers.tiled import Tiled, forward
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_splats
 
@@ -90,35 +89,6 @@ def test_when_saturated_tiles_are_dropped_changes_no_bit(monkeypatch):
     assert often[2] < 0.9 * never[2]
     assert often[0].equal(never[0])
     assert often[1].equal(never[1])
-
-
-@pytest.mark.parametrize("counts", [[], [0], [0, 0], [3], [0, 2, 0, 0, 1, 4, 0]], ids=str)
-def test_runs_repeat_as_often_as_they_count(counts):
-    lengths = torch.tensor(counts, dtype=torch.int32)
-    runs = runs_of(starts_of(lengths), lengths)
-    assert runs.dtype == torch.int32
-    assert runs.equal(torch.repeat_interleave(lengths).int())
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (4, 1), (1, 5), (3, 4)])
-def test_tiles_are_placed_where_they_were_taken_from(rows, columns):
-    image = torch.rand(4, rows * TILE, columns * TILE, generator=torch.Generator().manual_seed(1))
-    order = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(2))
-    tiles = layout.tiles_of(image.unbind(), order, columns, EAGER)
-    for tile, mine in zip(order.tolist(), tiles.unbind(dim=1), strict=True):
-        y, x = TILE * (tile // columns), TILE * (tile % columns)
-        assert mine.equal(image[:, y : y + TILE, x : x + TILE].reshape(4, PIXELS))
-    assert layout.placed(tiles, order, columns, EAGER).equal(image)
-    some = order[::2]
-    assert layout.tiles_of(image.unbind(), some, columns, EAGER).equal(tiles[:, ::2])
-
-
-def test_a_tile_without_splats_left_reads_the_padding_row():
-    rows = torch.arange(5.0)[:, None].expand(-1, 2)  # the last is the padding row
-    ids = torch.tensor([3, 1, 2], dtype=torch.int32)
-    at, ends = torch.tensor([0, 2, 3, 9]), torch.tensor([2, 3, 3, 3])
-    found = next_rows(rows, ids, at, ends, 3)
-    assert found[..., 0].tolist() == [[3, 1, 4], [2, 4, 4], [4, 4, 4], [4, 4, 4]]
 
 
 @pytest.mark.parametrize("rows", [[], [4], [5, 0, 3], list(range(9))], ids=str)

@@ -36,25 +36,23 @@ def test_a_torch_program_upsamples(tmp_path):
     torch.testing.assert_close(upsample(image, (8, 9)), image, atol=1e-6, rtol=0)  # brought back
 
 
-def test_an_onnx_network_upsamples(tmp_path):
+def test_an_onnx_network_upsamples():
     """tests/data/doubling.onnx is one node, which repeats pixels."""
     upsample, image = find_upsampler(str(Path(__file__).parent / "data" / "doubling.onnx")), torch.rand(8, 9, 3)
     doubled = image.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
     for size in (image, image[:6], image):
         torch.testing.assert_close(upsample(size, (2 * len(size), 18)), doubled[: 2 * len(size)])
-    with pytest.raises(FormatError, match=r"should give .*gives \[1, 1, 12, 10\]"):
-        find_upsampler(str(grey(tmp_path)))(torch.rand(6, 5, 3), (12, 10))
-
-
-def grey(folder: Path) -> Path:
-    """A torch program whose images have one channel."""
-    torch.export.save(torch.export.export(OneChannel(), (torch.rand(1, 3, 6, 5),)), folder / "grey.pt2")
-    return folder / "grey.pt2"
 
 
 class OneChannel(Doubling):
     def forward(self, x):
         return super().forward(x[:, :1])
+
+
+def test_a_program_whose_images_have_one_channel_is_refused(tmp_path):
+    torch.export.save(torch.export.export(OneChannel(), (torch.rand(1, 3, 6, 5),)), tmp_path / "grey.pt2")
+    with pytest.raises(FormatError, match=r"should give .*gives \[1, 1, 12, 10\]"):
+        find_upsampler(str(tmp_path / "grey.pt2"))(torch.rand(6, 5, 3), (12, 10))
 
 
 @pytest.mark.parametrize(
