@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import ANTIALIASED, CLASSIC
@@ -55,23 +56,9 @@ class Flat:
 
 
 def stored(scene: Gaussians) -> list[Stored]:
-    quats = scene.quats.double().numpy()
-    scales = np.exp(scene.log_scales.double().numpy())
-    found = []
-    for i in range(len(scene)):
-        w, x, y, z = quats[i] / np.linalg.norm(quats[i])
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        covariance = rotation @ np.diag(scales[i] ** 2) @ rotation.T
-        opacity = 1 / (1 + math.exp(-scene.logit_opacities[i].item()))
-        mean = scene.means[i].double().numpy()
-        found.append(Stored(mean, covariance, opacity, scene.sh[i].double().numpy()))
-    return found
+    means, quats, log_scales, logits, sh = (column.double().numpy() for column in scene.columns.values())
+    axes = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix() * np.exp(log_scales)[:, None]
+    return [*map(Stored, means, axes @ axes.transpose(0, 2, 1), 1 / (1 + np.exp(-logits)), sh)]
 
 
 def sh_colour(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:

@@ -846,10 +846,21 @@ WRONG = {  # "[*b" stands for a tensor of floats
 }
 
 
-@pytest.mark.parametrize("message", WRONG)
-def test_what_is_wrong_or_not_supported_is_said(message):
+WRONG_FOR_DISCS = {
+    "depth_mode: 'mean' is not one of expected, median": {"depth_mode": "mean"},
+    "absgrad: only False is supported": {"absgrad": True},
+    "quats: expected a tensor": {"quats": None},
+    "covars: is not an argument": {"covars": torch.zeros(40, 3, 3)},
+    "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
+}
+WRONG_CALLS = [(rasterization, *item) for item in WRONG.items()]
+WRONG_CALLS += [(rasterization_2dgs, *item) for item in WRONG_FOR_DISCS.items()]
+
+
+@pytest.mark.parametrize(("function", "message", "wrong"), WRONG_CALLS)
+def test_what_is_wrong_or_not_supported_is_said(function, message, wrong):
     with pytest.raises(UsageError) as error:
-        rasterization(**gaussians() | two_views() | WRONG[message])
+        function(**gaussians() | two_views() | wrong)
     message = re.sub(r"expected \[(\*b[^]]*)\]", r"expected a tensor [\1] of float32 or float64", message)
     assert str(error.value).startswith(message)
 
@@ -862,19 +873,3 @@ def test_compiled_is_never_eager_without_a_word(monkeypatch, dtype, later):
     with pytest.raises(UsageError, match=rf"^rasterizer: no kernel 'composite-point' {problem}.*\beagerly{later}$"):
         rasterization(**call, rasterizer="compiled")
     rasterization(**call, rasterizer="auto")
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"depth_mode": "mean"}, "depth_mode: 'mean' is not one of expected, median"),
-        ({"absgrad": True}, "absgrad: only False is supported"),
-        ({"quats": None}, "quats: expected a tensor"),
-        ({"covars": torch.zeros(40, 3, 3)}, "covars: is not an argument"),
-        ({"rasterizer": "cuda"}, "rasterizer: 'cuda' is not one of"),
-    ],
-)
-def test_what_is_wrong_with_discs_is_said(wrong, message):
-    with pytest.raises(UsageError) as error:
-        rasterization_2dgs(**gaussians() | two_views() | wrong)
-    assert str(error.value).startswith(message)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import re
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -152,24 +151,14 @@ def test_help_shows_every_range(verb, capsys):
             assert f"{option.flags[0]}{option.argument.metavar}".replace(" ", "") in shown
 
 
-SHARES = {
-    "1/4": 0.25,
-    "25%": 0.25,
-    "0.25": 0.25,
-    "12.5%": 0.125,
-    "2/1": 2.0,
-    "1/0": None,
-    "1/": None,
-    "%": None,
-    "1/2/4": None,
-}
+def test_a_share_is_written_as_people_write_it():
+    def scale(word: str) -> float:
+        return VERBS["render"].parse(["s.ply", "-o", "out", "--scale", word]).scale
 
-
-@pytest.mark.parametrize("word", SHARES)
-def test_a_share_is_written_as_people_write_it(word):
-    refused = pytest.raises(UsageError, match=f"--scale: takes 0.001..64, got {word}")
-    with nullcontext() if SHARES[word] else refused:
-        assert VERBS["render"].parse(["s.ply", "-o", "out", "--scale", word]).scale == SHARES[word]
+    assert [scale(word) for word in ("1/4", "25%", "0.25", "12.5%", "2/1")] == [0.25, 0.25, 0.25, 0.125, 2.0]
+    for word in ("1/0", "1/", "%", "1/2/4"):
+        with pytest.raises(UsageError, match=f"--scale: takes 0.001..64, got {word}"):
+            scale(word)
 
 
 WRONG = """

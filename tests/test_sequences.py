@@ -94,53 +94,42 @@ def test_flicker_of_a_still_scene_in_time_is_undefined(tmp_path):
     assert tables(report)[0] == f"no flicker at 1/2: {why}"
 
 
-def gap(folder):
-    (folder / "frame_0002.ply").unlink()
+def write(folder, name, **changes):
+    write_scene(folder / name, replace(make_scene(40), **changes), overwrite=True)
 
 
-def twice(folder):
-    (folder / "frame_002.ply").write_bytes((folder / "frame_0002.ply").read_bytes())
+SPOILED = {
+    "in: expected frame 2 after frame_0001.ply, got frame_0003.ply; or name one": (
+        lambda folder: (folder / "frame_0002.ply").unlink()
+    ),
+    "expected frame 3 after frame_0002.ply, got frame_002.ply": lambda folder: write(folder, "frame_002.ply"),
+    "holds frames of 2 sequences (frame_####.ply, other####.ply)": (
+        lambda folder: [write(folder, f"other{number}.ply") for number in (1, 2)]
+    ),
+    "frame_0003.ply: expected the degree of harmonics of frame_0001.ply, ": (
+        lambda folder: write(folder, "frame_0003.ply", sh=make_scene(40).sh[:, :1])
+    ),
+    "frame_0003.ply: expected the convention of frame_0001.ply, classic, got mip": (
+        lambda folder: write(folder, "frame_0003.ply", convention=MIP)
+    ),
+}
 
 
-def two(folder):
-    for number in (1, 2):
-        write_scene(folder / f"other{number}.ply", make_scene(3))
-
-
-def fewer(folder):
-    write_scene(folder / "frame_0002.ply", make_scene(39), overwrite=True)
-
-
-def degree(folder):
-    write_scene(folder / "frame_0003.ply", replace(make_scene(40), sh=make_scene(40).sh[:, :1]), overwrite=True)
-
-
-def convention(folder):
-    write_scene(folder / "frame_0003.ply", replace(make_scene(40), convention=MIP), overwrite=True)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (gap, "in: expected frame 2 after frame_0001.ply, got frame_0003.ply; or name one"),
-        (twice, "expected frame 3 after frame_0002.ply, got frame_002.ply"),
-        (two, "holds frames of 2 sequences (frame_####.ply, other####.ply)"),
-        (fewer, "frame_0002.ply: expected the number of Gaussians of frame_0001.ply, 40, got 39; pass `frames_apart`"),
-        (degree, "frame_0003.ply: expected the degree of harmonics of frame_0001.ply, "),
-        (convention, "frame_0003.ply: expected the convention of frame_0001.ply, classic, got mip"),
-    ],
-)
-def test_what_is_no_sequence_is_refused(folder, spoil, message):
-    spoil(folder)
+@pytest.mark.parametrize("message", SPOILED)
+def test_what_is_no_sequence_is_refused(folder, message):
+    SPOILED[message](folder)
     with pytest.raises(FormatError) as caught:
         read_scene(folder)
     assert message in str(caught.value)
-    if spoil is fewer:
-        assert (
-            Renderer.of(read_scene(folder, frames_apart=True), CAMERAS, "auto")(replace(FAR, frame=1))
-            .rgb.isfinite()
-            .all()
-        )
+
+
+def test_a_frame_of_fewer_gaussians_is_one_that_was_trained_apart(folder):
+    write_scene(folder / "frame_0002.ply", make_scene(39), overwrite=True)
+    said = r"frame_0002.ply: expected the number of Gaussians of frame_0001.ply, 40, got 39; pass `frames_apart`"
+    with pytest.raises(FormatError, match=said):
+        read_scene(folder)
+    apart = Renderer.of(read_scene(folder, frames_apart=True), CAMERAS, "auto")
+    assert apart(replace(FAR, frame=1)).rgb.isfinite().all()
 
 
 def test_levels_of_detail_for_a_viewer_are_no_frames(tmp_path):

@@ -7,22 +7,15 @@ import pytest
 import torch
 
 from aaplug.core.spectra import energies, frequency_response
-from aaplug.core.splats import Splats2D
 from aaplug.evaluation.coverage import above_nyquist
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, splats_of
 
 F64 = torch.float64
 STEP, SIDE = 0.1, 200  # px; of a grid that holds both splats whole
-SPLATS = Splats2D(
-    means=torch.zeros(2, 2, dtype=F64),
-    covs=torch.tensor([[0.3, 0.1, 0.2], [4.0, -1.5, 1.0]], dtype=F64),
-    dets=torch.tensor([0.05, 1.75], dtype=F64),
-    depths=torch.ones(2, dtype=F64),
-    opacities=torch.tensor([0.7, 0.4], dtype=F64),
-    sources=torch.arange(2),
-)
+ROWS = ((0.7, (0.3, 0.1, 0.2)), (0.4, (4.0, -1.5, 1.0)))
+SPLATS = splats_of(*(((0.0, 0.0), cov, 1.0, opacity, (1.0, 1.0, 1.0)) for opacity, cov in ROWS))
 LINE = (torch.arange(SIDE, dtype=F64) - SIDE / 2) * STEP
 GRID = torch.cartesian_prod(LINE, LINE)
 ALPHA = (SPLATS.opacities * POINT.exact(SPLATS, GRID[:, None].expand(-1, 2, -1))).T

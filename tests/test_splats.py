@@ -10,20 +10,13 @@ from aaplug.core.convolution import smoothed_by, volume_log_factor
 from aaplug.core.ellipses import cull, squared_cutoff, whitening
 from aaplug.core.gaussians import MIN_OPACITY, scale_opacities
 from aaplug.core.splats import Splats2D
-from tests.conftest import make_scene, make_splats
+from tests.conftest import make_scene, make_splats, splats_of
 
 F64 = torch.float64
 
 
 def splat(xx: float, xy: float, yy: float, opacity: float = 1.0, dtype=F64) -> Splats2D:
-    return Splats2D(
-        means=torch.tensor([[10.0, 20.0]], dtype=dtype),
-        covs=torch.tensor([[xx, xy, yy]], dtype=dtype),
-        dets=torch.tensor([xx * yy - xy * xy], dtype=dtype),
-        depths=torch.ones(1, dtype=dtype),
-        opacities=torch.tensor([opacity], dtype=dtype),
-        sources=torch.zeros(1, dtype=torch.long),
-    )
+    return splats_of(((10.0, 20.0), (xx, xy, yy), 1.0, opacity, (1.0, 1.0, 1.0))).to(dtype)
 
 
 def same(one: Splats2D, other: Splats2D) -> None:
