@@ -101,10 +101,6 @@ def test_an_error_of_the_system_is_told_by_what_it_is(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: unexpected OSError: cannot allocate memory\n"
 
 
-def test_a_comma_at_the_end_names_no_view(cli):
-    cli.done("render scene.ply --cameras . -o new --views r_0, --scale 0.5")
-
-
 def test_an_empty_scene_is_neither_tuned_nor_measured(cli):
     write_scene("scene.ply", make_scene(0), overwrite=True)
     for words, use in (

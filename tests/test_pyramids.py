@@ -256,7 +256,7 @@ def built(dataset, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("built")
     shutil.copytree(dataset, folder, dirs_exist_ok=True)
     with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
-        main(["lod", "scene.ply", "--cameras", ".", "-o", "levels", "--levels", "2", "--steps", "3"])
+        main(["lod", "scene.ply", "--cameras", ".", "-o", "levels", "--levels", "2", "--steps", "1"])
     return folder / "levels"
 
 
@@ -293,13 +293,13 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     first = {file.name: file.read_bytes() for file in folder.iterdir()}
     shutil.rmtree(folder)
     with pytest.raises(KeyboardInterrupt):
-        lod("scene.ply", ".", folder, levels=2, steps=3, monitor=Interrupting())
+        lod("scene.ply", ".", folder, levels=2, steps=1, monitor=Interrupting())
     assert {file.name: file.read_bytes() for file in folder.glob("*.ply")}.items() < first.items()
     cli.refused("info levels", "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`")
-    _, err = cli.done("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
+    _, err = cli.done("lod scene.ply --cameras . -o levels --levels 2 --steps 1 --resume")
     assert "resumed with 1 level" in err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == first
-    cli.refused("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume", "other options")
+    cli.refused("lod scene.ply --cameras . -o levels --levels 2 --steps 2 --resume", "other options")
 
 
 def test_fewer_levels_leave_nothing_of_more(cli, folder):
