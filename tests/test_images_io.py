@@ -42,9 +42,8 @@ NOT_IMAGES = {
 @pytest.mark.parametrize("case", NOT_IMAGES)
 def test_what_is_no_image_is_not_written(tmp_path, case):
     image, options, said = NOT_IMAGES[case]
-    write = (
-        partial(write_png, tmp_path / "image.png") if options else checked_image
-    )  # tests type-check `write_png` itself
+    # tests type-check `write_png` itself
+    write = partial(write_png, tmp_path / "image.png") if options else checked_image
     with pytest.raises(UsageError, match=re.escape(said)):
         write(image, **options)
     assert not list(tmp_path.iterdir())

@@ -15,7 +15,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import rotation_matrices
+from aaplug.core.projection import quats_of, rotation_matrices
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
@@ -220,6 +220,12 @@ def test_extreme_sizes_and_transparent_gaussians_are_merged():
     assert all(column.isfinite().all() for column in found.columns.values())
     clusters = clusters_of(scene, torch.full((60,), RATE))
     assert (costs(clusters[:-1], clusters[1:], 1.0) <= MAX_COST).all()
+
+
+def test_rotations_become_quaternions_again():
+    scene = make_scene(50, dtype=torch.float64)
+    again = quats_of(rotation_matrices(scene.unit_quats))
+    torch.testing.assert_close((again * scene.unit_quats).sum(dim=1).abs(), torch.ones(50, dtype=torch.float64))
 
 
 def test_one_lighter_scene(cli):

@@ -244,12 +244,9 @@ def test_a_camera_of_usd_brings_lens_aperture_and_shutter(tmp_path):
 def test_frames_of_usd_are_those_of_its_stage_and_one_key_holds(tmp_path, old, new, frames, z):
     pytest.importorskip("pxr")
     assert USDA.count(old) == 1
-    other = (
-        frames > 1
-    ) * 'def Camera "other"\n{\n token visibility.timeSamples = { 1: "inherited", 3: "invisible" }\n}\n'
-    path = read_camera_path(
-        written(tmp_path, "path.usda", USDA.replace(old, new).replace("def Xform", other + "def Xform"))
-    )
+    other = 'def Camera "other"\n{\n token visibility.timeSamples = { 1: "inherited", 3: "invisible" }\n}\n'
+    text = USDA.replace(old, new).replace("def Xform", (frames > 1) * other + "def Xform")
+    path = read_camera_path(written(tmp_path, "path.usda", text))
     assert (path.fps, len(path.cameras), path.cameras[-1].centre[2].item(), path.unsized) == (24, frames, z, True)
     assert path.shutter == (0.5 if frames < 5 else 1)
 

@@ -60,9 +60,8 @@ def opened(browser, window, address):
             context, known = window
             usual = where == address and size == (WIDTH, HEIGHT) and not other
             if not usual:
-                context = browser.new_context(
-                    viewport=dict(zip(("width", "height"), size, strict=True)), **USUAL | other
-                )
+                viewport = {"width": size[0], "height": size[1]}
+                context = browser.new_context(viewport=viewport, **USUAL | other)
                 contexts.callback(context.close)
             page = context.new_page()
             contexts.callback(page.close)
@@ -248,21 +247,16 @@ def test_a_double_click_sets_the_point_to_turn_about(opened):
     after = camera_of(page)
     depth = state(page)["depth"]
     assert 1 < depth < 8
-    point = (
-        before.cam_from_world.inverse()
-        @ torch.tensor(
-            [(x - 0.5) * before.width / before.fx * depth, (y - 0.5) * before.height / before.fy * depth, depth, 1.0]
-        ).double()
-    )
-    [middle], _ = after.project(point[None, :3])
-    torch.testing.assert_close(middle, torch.tensor([after.width, after.height]).double() / 2, atol=2.0, rtol=0)
+    slopes = (x - 0.5) * before.width / before.fx, (y - 0.5) * before.height / before.fy
+    point = before.cam_from_world.inverse() @ torch.tensor([slopes[0] * depth, slopes[1] * depth, depth, 1.0]).double()
     drag(page, (0.2, 0.5), (0.4, 0.6))
     at_rest(page, at="")
-    [middle], _ = camera_of(page).project(point[None, :3])
-    torch.testing.assert_close(middle, torch.tensor([after.width, after.height]).double() / 2, atol=2.0, rtol=0)
+    for camera in (after, camera_of(page)):
+        [middle], _ = camera.project(point[None, :3])
+        torch.testing.assert_close(middle, torch.tensor([after.width, after.height]).double() / 2, atol=2.0, rtol=0)
 
 
-def test_the_background_is_chosen_and_forgotten(opened):
+def test_the_background_is_chosen_and_forgotten_and_full_screen_goes_on_and_off(opened):
     page = opened()
     before = image(page)[2, 2]
     page.fill("#background", "#ff8000")
@@ -272,6 +266,10 @@ def test_the_background_is_chosen_and_forgotten(opened):
     page.click("#asTrained")
     at_rest(page, at="0")
     assert torch.equal(image(page)[2, 2], before)
+    page.click("#full")
+    page.wait_for_function("document.fullscreenElement !== null")
+    page.keyboard.press("g")
+    page.wait_for_function("document.fullscreenElement === null")
 
 
 def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
@@ -281,11 +279,13 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
       data.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
       document.querySelector('#stage').dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true}));
     }"""
+    name = "other ☃'s.ply"
+    write_scene(tmp_path / name, make_scene(70))
+    other = [name, b64encode((tmp_path / name).read_bytes()).decode()]
     one.evaluate(drop, ["bad.ply", b64encode(b"no scene").decode()])
     one.locator("#said", has_text="bad.ply").wait_for()
-    write_scene(tmp_path / "other ☃'s.ply", make_scene(70))
-    one.evaluate(drop, ["other ☃'s.ply", b64encode((tmp_path / "other ☃'s.ply").read_bytes()).decode()])
-    one.locator("#said", has_text="opened other ☃'s.ply").wait_for()
+    one.evaluate(drop, other)
+    one.locator("#said", has_text=f"opened {name}").wait_for()
     at_rest(one)
     assert one.inner_text("#facts").startswith("70 Gaussians")
     assert two.inner_text("#facts").startswith("200 Gaussians")
@@ -295,22 +295,12 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     one.reload()
     at_rest(one)
     assert state(one)["pose"] == state(two)["pose"]  # the server's scene, without the camera of the other
-    with serving(tmp_path / "other ☃'s.ply", seen[1], port=0, rasterizer="eager") as address:
+    with serving(tmp_path / name, seen[1], port=0, rasterizer="eager") as address:
         three = opened(where=address, as_opened=True)
-        three.evaluate(drop, ["other ☃'s.ply", b64encode((tmp_path / "other ☃'s.ply").read_bytes()).decode()])
-        three.locator(
-            "#said", has_text="opened other ☃'s.ply"
-        ).wait_for()  # of that name and count, but without cameras
+        three.evaluate(drop, other)
+        three.locator("#said", has_text=f"opened {name}").wait_for()  # of the same name and count, but without cameras
         assert "training rate assumed" in three.inner_text("#facts")
         three.close()
-
-
-def test_full_screen_goes_on_and_off(opened):
-    page = opened()
-    page.click("#full")
-    page.wait_for_function("document.fullscreenElement !== null")
-    page.keyboard.press("g")
-    page.wait_for_function("document.fullscreenElement === null")
 
 
 def test_a_refusal_is_not_acknowledged(opened):
