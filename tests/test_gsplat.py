@@ -648,9 +648,8 @@ def training() -> tuple[dict[str, Parameter], dict[str, Optimizer], Callable[...
     splats |= {"opacities": start.logit_opacities, "sh0": start.sh[:, :1], "shN": start.sh[:, 1:]}
     params = {name: Parameter(value) for name, value in splats.items()}
     view = cameras([make_camera((0.0, -3.0, 0.5), (24, 20))], torch.float32)
-    photograph = rasterization(truth.means, truth.quats, truth.scales, truth.opacities, truth.sh, **view, sh_degree=1)[
-        0
-    ]
+    shapes = truth.means, truth.quats, truth.scales, truth.opacities
+    photograph, *_ = rasterization(*shapes, truth.sh, **view, sh_degree=1)
 
     def draw(**words: object) -> tuple[Tensor, dict[str, object]]:
         activated = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()

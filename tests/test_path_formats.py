@@ -83,6 +83,11 @@ def glb(folder: Path) -> Path:
     return folder / "path.glb"
 
 
+def gltf_with_buffer(folder: Path) -> Path:
+    (folder / "path.bin").write_bytes(binary())
+    return written(folder, "path.gltf", gltf(binary(), "path.bin"))
+
+
 def written(folder: Path, name: str, content: object) -> Path:
     (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
     return folder / name
@@ -134,10 +139,11 @@ def test_lichtfelds_timeline_is_turned_into_the_scenes_axes_and_eased(tmp_path):
 def test_a_camera_of_gltf_moves_with_the_nodes_above_it(tmp_path, kind):
     if kind == "glb":
         file = glb(tmp_path)
+    elif kind == "file":
+        file = gltf_with_buffer(tmp_path)
     else:
-        (tmp_path / "path.bin").write_bytes(binary())
-        data = "data:application/octet-stream;base64," + base64.b64encode(binary()).decode()
-        file = written(tmp_path, "path.gltf", gltf(binary(), "path.bin" if kind == "file" else data))
+        uri = "data:application/octet-stream;base64," + base64.b64encode(binary()).decode()
+        file = written(tmp_path, "path.gltf", gltf(binary(), uri))
     path = read_camera_path(file)
     assert (path.fps, len(path.cameras)) == (10, 21)
     camera = path.cameras[10]

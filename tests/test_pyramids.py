@@ -366,7 +366,7 @@ def test_a_broken_pyramid_is_refused_in_one_line(built, tmp_path, case):
     folder = Path(shutil.copytree(built, tmp_path / "levels"))
     breaking(folder / "scene_lod1.ply", folder / MANIFEST)
     with pytest.raises(FormatError, match=f"^[^\\n]*{said}[^\\n]*$"):
-        read_pyramid(folder)
+        Renderer.of(folder, VIEWS)
 
 
 def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):

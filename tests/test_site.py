@@ -133,25 +133,17 @@ def test_fields_of_a_docstring_become_a_list():
     )
 
 
-@pytest.fixture
-def gallery(browser, hooks, tmp_path):
-    """One slider of the gallery, as the site shows it."""
+def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both_pictures(browser, hooks, tmp_path):
     names = ("chair-r_136-100-classic.webp", "chair-r_136-100-auto.webp")
     images = "".join(f'<img alt="{name[16:-5]}" src="{(FOLDER / name).as_uri()}">' for name in names)
     script, style = hooks["script"](), hooks["style"]()
     (tmp_path / "page.html").write_text(
         f"<!doctype html><style>{style}</style><div class=compare>{images}</div><script>{script}</script>"
     )
-    page, troubles = browser.new_page(viewport={"width": 390, "height": 844}), []
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    page.goto((tmp_path / "page.html").as_uri())
-    page.wait_for_selector(".compare[data-split='0.500']")
-    yield page
-    page.close()
-    assert troubles == []
-
-
-def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both_pictures(gallery):
+    gallery, troubles = browser.new_page(viewport={"width": 390, "height": 844}), []
+    gallery.on("pageerror", lambda error: troubles.append(str(error)))
+    gallery.goto((tmp_path / "page.html").as_uri())
+    gallery.wait_for_selector(".compare[data-split='0.500']")
     box = gallery.locator(".stage canvas").bounding_box()
     gallery.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
     gallery.mouse.down()
@@ -166,6 +158,8 @@ def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both
     gallery.locator("input[type=checkbox]").check()
     assert gallery.locator(".crops canvas").count() == 2
     assert gallery.locator(".crops").inner_text().split() == ["classic", "auto"]
+    gallery.close()
+    assert troubles == []
 
 
 PAGE = (

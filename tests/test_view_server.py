@@ -29,7 +29,6 @@ GOOD = {
 }  # fmt: skip
 REFUSED = {
     "pose of NaN": ({"pose": [math.nan] * 16}, "pose: takes a number"),
-    "pose of infinity": ({"pose": [math.inf, *POSE[1:]]}, "pose: takes a number"),
     "pose of words": ({"pose": ["../../etc/passwd"] * 16}, "pose: takes a number"),
     "short pose": ({"pose": POSE[:12]}, "pose: takes 16 numbers"),
     "mirror": ({"pose": [-1.0, *POSE[1:]]}, "pose: takes a rotation"),
