@@ -44,16 +44,7 @@ def test_a_misspelt_keyword_and_nothing_else_is_an_error(tmp_path):
     (tmp_path / "user.py").write_text(SCRIPT + "".join(lines))
     how = {"extraPaths": [str(ROOT)], "typeCheckingMode": "standard"}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(how))
-    command = [
-        sys.executable,
-        "-m",
-        "basedpyright",
-        "--outputjson",
-        "--pythonpath",
-        sys.executable,
-        "-p",
-        str(tmp_path),
-    ]
+    command = [sys.executable, "-m", "basedpyright", "--outputjson", "--pythonpath", sys.executable, "-p", "."]
     answer = json.loads(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300).stdout)
     assert answer["summary"]["filesAnalyzed"] == 1
     script = (tmp_path / "user.py").read_text().splitlines(keepends=True)

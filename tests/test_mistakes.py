@@ -50,17 +50,10 @@ def test_a_full_disk_behind_stdout_is_one_line(cli, words):
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        f"info {LONG}.ply",
-        f"render scene.ply --cameras . -o {LONG}/x",
-        f"evaluate scene.ply --cameras . -o {LONG} --recipe classic",
-        f"convert scene.ply --cameras . -o {LONG}.ply",
-    ],
-)
+@pytest.mark.parametrize("words", ["render -o LONG/x", "evaluate --recipe classic -o LONG", "convert -o LONG.ply"])
 def test_names_longer_than_the_file_system_takes(cli, words):
-    cli.refused(words, "name too long")
+    cli.refused(f"info {LONG}.ply", "name too long")
+    cli.refused(f"{words.replace('LONG', LONG)} --cameras . scene.ply", "name too long")
 
 
 def test_views_with_long_names_are_written(cli):

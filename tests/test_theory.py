@@ -1,20 +1,20 @@
 """The statements of theory.md, held against the program's own filters and levels."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import faded
 from aaplug.core.splats import Splats2D
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.rendering.renderer import Renderer
 from tests.bench.theory import CELLS, LARGEST_THIRD, error
-from tests.conftest import splats_of, straight_camera
+from tests.conftest import make_scene, splats_of, straight_camera
 
 F64 = torch.float64
 VARIANCE, RATE, KAPPA = 0.1, 1 / 8, 0.3  # px² of training, and training's dilation
@@ -29,13 +29,8 @@ def light(splats: Splats2D) -> Tensor:
 def splats_by(recipe: str, rate: float) -> Splats2D:
     """A round splat of the variance, as a recipe shows it at a rate."""
     sigma = math.log(math.sqrt(VARIANCE) * 4.0 / 200.0)
-    scene = Gaussians(
-        torch.zeros(1, 3, dtype=F64),
-        torch.tensor([[1.0, 0, 0, 0]], dtype=F64),
-        torch.full((1, 3), sigma, dtype=F64),
-        torch.full((1,), 6.0, dtype=F64),
-        torch.zeros(1, 1, 3, dtype=F64),
-    )
+    columns = {"log_scales": torch.full((1, 3), sigma, dtype=F64), "logit_opacities": torch.tensor([6.0], dtype=F64)}
+    scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64), **columns)
     renderer = Renderer.of(scene, CameraSet((CAMERA,), (CAMERA,)), RECIPES[recipe], rasterizer="reference")
     return renderer.splats(CAMERA.scaled(rate))
 

@@ -43,17 +43,9 @@ def written(tmp_path_factory):
     for i, view in enumerate(views):
         write_png(folder / f"{i}.png", renderer(view).rgb * 0.9 + 0.05)
         views[i] = replace(view, photo=folder / f"{i}.png")
-    report = evaluate(
-        scene,
-        CameraSet(tuple(views), tuple(views), notes=(NASTY,)),
-        recipe=("classic", "auto"),
-        scale=(1.0, 0.5, 2.0),
-        background="black",
-        rasterizer="eager",
-        output=folder,
-        report=True,
-        name=f"scene {NASTY}",
-    )
+    how = {"recipe": ("classic", "auto"), "scale": (1.0, 0.5, 2.0), "background": "black", "rasterizer": "eager"}
+    cameras = CameraSet(tuple(views), tuple(views), notes=(NASTY,))
+    report = evaluate(scene, cameras, output=folder, report=True, name=f"scene {NASTY}", **how)
     return folder, report, coverage(scene, training, report.scales)
 
 
