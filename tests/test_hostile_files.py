@@ -16,8 +16,8 @@ from tests.hostile import check
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
 TARGETS = {**scenes(), **cameras(), **paths(), **others()}
-FILES = 30  # of each reader
-USD_FILES = 4  # each is read in a process of its own
+FILES = 50  # of each reader
+USD_FILES = 5  # each is read in a process of its own
 
 
 @pytest.mark.parametrize("name", [name for name in TARGETS if name != "scene of usd"])  # it is read as .usdc is
