@@ -58,7 +58,7 @@ def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
     means = torch.cat([level.scene.means for level in levels])
     low, high = (torch.tensor(index["tree"]["bound"][end]) for end in ("min", "max"))
     torch.testing.assert_close(torch.stack([low, high]), torch.stack([means.amin(dim=0), means.amax(dim=0)]))
-    for resume, said in ((False, "already holds lod-meta"), (True, "out: is of a run that is complete: nothing is left")):
+    for resume, said in ((False, "already holds lod-meta"), (True, "out: is of a run that is complete")):
         with pytest.raises(OutputError, match=said):
             made(tmp_path / "out", "sog", resume=resume)
 

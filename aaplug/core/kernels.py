@@ -7,7 +7,6 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -28,8 +27,7 @@ class Kernel:
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
-    overlaps: it computes many independent values in turn, so g++ should schedule instructions before it allocates
-        registers: "freely", or "within registers" where it also keeps many sums, and on processors with few.
+    keeps_sums: it keeps many sums, so where g++ schedules instructions it has to count the registers.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     updates: positions of the arguments that it updates in place; they must be contiguous.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
@@ -41,7 +39,7 @@ class Kernel:
     sizes: tuple[str | None, ...]
     gathers: bool = False
     chained: bool = False
-    overlaps: Literal["freely", "within registers"] | None = None
+    keeps_sums: bool = False
     pulls_back: bool = False
     updates: tuple[int, ...] = ()
     evaluations: int = 0

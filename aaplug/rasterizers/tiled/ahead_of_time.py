@@ -98,10 +98,16 @@ TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # Operations up to which inductor writes a value out again for each of its readers, where kernels are chained.
 CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
 # What only profilers read, where torch knows these settings: three quarters of a package, a tenth of compiling.
-FOR_PROFILERS = ("enable_frame_pointer", "enable_line_tables")
+FOR_PROFILERS = ("aot_inductor.enable_frame_pointer", "aot_inductor.enable_line_tables")
+# Inductor tries out which of the processor's instruction sets compile and load, for 8 s of a processor.  g++ knows its
+# own processor, and results are compared; but a g++ can be too old for a processor's AMX.
+TRIED_OUT, MAYBE_TOO_NEW = "cpp.vec_isa_ok", "amx"
+# torch's headers are precompiled for each set of g++'s options: 10 s of a processor, and 3 s less for each kernel.
+PRECOMPILES = "aot_inductor.precompile_headers"
 THIS_PROCESSOR = "native"  # as g++ calls its architecture
-# g++'s options, of `Kernel.overlaps`; they follow the architecture, the only setting whose text reaches g++.
-SCHEDULING = {"freely": "-fschedule-insns", "within registers": "-fschedule-insns -fsched-pressure"}
+# g++ orders instructions before it allocates registers, so that values overlap; with the second option it counts these.
+# They follow the architecture, the only setting whose text reaches g++.
+SCHEDULING = ("-fschedule-insns", "-fschedule-insns -fsched-pressure")
 MANY_REGISTERS = "AVX512"  # 32 of vectors; without it there are 16, and g++ has to count them wherever it schedules
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
@@ -413,20 +419,23 @@ def _build(
 
 def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
     """Inductor's settings; raises UsageError if this torch or the compiler takes no target."""
-    from torch._inductor.config import aot_inductor, cpp  # takes long
+    from torch._inductor.config import cpp  # takes long
 
     configs = OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED_OPTIONS if kernel.chained else {})
-    configs |= {f"aot_inductor.{name}": False for name in FOR_PROFILERS if hasattr(aot_inductor, name)}
+    where_known = dict.fromkeys(FOR_PROFILERS, False)
     x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     if x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
         capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
-        overlaps = "within registers" if kernel.overlaps and capability != MANY_REGISTERS else kernel.overlaps
-        march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[overlaps] if overlaps else ''}".strip()
-        return configs | {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
-    if target is not None:
+        within_registers = kernel.keeps_sums or capability != MANY_REGISTERS
+        march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[within_registers]}"
+        configs |= {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
+        where_known |= {TRIED_OUT: True} if MAYBE_TOO_NEW not in _processor() else {}
+        where_known |= {PRECOMPILES: False} if kernel.keeps_sums and capability == MANY_REGISTERS else {}
+    elif target is not None:
         raise UsageError("bundle", f"needs {STANDARD_COMPILER} and a torch that tells it the architecture")
-    return configs
+    known = torch._inductor.list_options()
+    return configs | {name: value for name, value in where_known.items() if name in known}
 
 
 class _Module(torch.nn.Module):

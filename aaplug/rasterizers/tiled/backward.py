@@ -218,7 +218,7 @@ def step_kernel(pixel: PixelKernel, channels: int = 3) -> Kernel:
         partial(_step, pixel),
         lambda: (*tiles_example(pixel, channels, len(planes)), *(torch.zeros(EXAMPLE_TILES, n) for n in widths)),
         ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None, "t", "t"),
-        overlaps="within registers",
+        keeps_sums=True,
         updates=(last := planes[-1] + 3 + coordinates_of(pixel), last + 1),
     )
 

@@ -296,7 +296,6 @@ def pass_kernel(pixel: PixelKernel, channels: int = 3, keeps: bool = False) -> K
         partial(_pass, pixel, keeps),
         partial(tiles_example, pixel, channels, len(planes)),
         ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None),
-        overlaps="freely",
         updates=tuple(planes)[keeps:],
         evaluations=pixel.splats_per_pass,
     )
