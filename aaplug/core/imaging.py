@@ -22,12 +22,19 @@ SRGB_KNEE = 0.04045  # up to which sRGB is proportional to light
 
 
 @contract
-def over(rgb: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
-    """Composite premultiplied colours over a background; channels after the third have none."""
-    if not any(background):  # black adds nothing
-        return Render(rgb, alpha)
-    behind = functional.pad(rgb.new_tensor(background), (0, rgb.shape[2] - 3))
-    return Render(torch.addcmul(rgb, (1 - alpha)[..., None], behind), alpha)
+def over(
+    rgb: Float[Tensor, "h w d"],
+    alpha: Float[Tensor, "h w"],
+    background: tuple[float, float, float] | Float[Tensor, " c"],
+) -> Render:
+    """Composite premultiplied colours over a background; further channels have none."""
+    if not isinstance(background, Tensor):
+        if not any(background):  # black adds nothing
+            return Render(rgb, alpha)
+        background = rgb.new_tensor(background)
+    behind = functional.pad(background, (0, rgb.shape[2] - len(background)))
+    # as an outer product, whose gradient is a matrix times a vector
+    return Render(torch.addr(rgb.flatten(0, 1), (1 - alpha).flatten(), behind).view(rgb.shape), alpha)
 
 
 def linear(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

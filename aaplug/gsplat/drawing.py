@@ -9,10 +9,10 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from aaplug.core.colours import BLACK
 from aaplug.core.ellipses import squared_cutoff
+from aaplug.core.imaging import over
 from aaplug.core.interfaces import PixelKernel, Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
@@ -84,7 +84,7 @@ def drawer(rasterizer: Rasterizer, options: Options, pixel: PixelKernel) -> Call
 def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view: View, options: Options) -> Tensor:
     """The channels of `features_of` over the background, and depth divided by alpha where it is to be expected."""
     if view.background is not None and options.coloured:
-        image = image + (1 - alpha) * functional.pad(view.background, (0, image.shape[2] - len(view.background)))
+        image = over(image, alpha[..., 0], view.background).rgb
     if options.render_mode.endswith("ED"):
         colours, depth = image.movedim(2, 0).split([image.shape[2] - 1, 1])  # as they lie in memory
         depth = depth / alpha.movedim(2, 0).clamp(min=MIN_ALPHA_OF_DEPTH)
