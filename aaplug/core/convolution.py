@@ -44,5 +44,5 @@ def face_log_factor(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "
 
 
 def _axis_log_factors(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]) -> Float[Tensor, "n 3"]:
-    log_ratio = 2 * (log_sigma - log_scales)
+    log_ratio = torch.where(log_sigma == -torch.inf, -torch.inf, 2 * (log_sigma - log_scales))  # also where both are
     return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))
