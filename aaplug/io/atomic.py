@@ -44,7 +44,7 @@ def replacing(path: AnyPath, overwrite: bool) -> Iterator[BinaryIO]:
 
 
 def write_file(path: AnyPath, content: bytes, overwrite: bool) -> None:
-    """Write a file whose content is known."""
+    """Write a file whose content is known, whole or not at all; raises OutputError as `replacing`."""
     with replacing(path, overwrite) as stream:
         stream.write(content)
 

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import levels
-from aaplug.io.atomic import AnyPath, replacing
+from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import contract
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of
@@ -92,9 +92,7 @@ def write_png(path: AnyPath, rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, ov
     """
     if Path(path).suffix.lower() != ".png":
         raise OutputError(path, "is no name of a PNG, which ends in .png; `aaplug.render` writes other formats")
-    png = encoded(".png", rgb, bit_depth=bit_depth)
-    with replacing(path, overwrite) as stream:
-        stream.write(png)
+    write_file(path, encoded(".png", rgb, bit_depth=bit_depth), overwrite)
 
 
 def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "h w c"]:

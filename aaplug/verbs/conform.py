@@ -14,7 +14,7 @@ from torch import Tensor
 from aaplug.core.colours import BLACK
 from aaplug.evaluation.conformance import CAMERA, SIDE, TESTS, Conformance, draw, judged
 from aaplug.evaluation.report.files import as_json
-from aaplug.io.atomic import AnyPath, make_folder, refuse_existing, replacing
+from aaplug.io.atomic import AnyPath, make_folder, refuse_existing, write_file
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import write_scene
 from aaplug.methods.viewers import CLASSIC_VIEWER, Viewer, find_viewer
@@ -79,8 +79,7 @@ def conform(
             entry = {"id": 0, "img_name": CAMERA.name, "width": SIDE, "height": SIDE, **place}  # as 3DGS writes it
             for test, (scene, camera) in files.items():
                 write_scene(scene, test.stored, overwrite=overwrite)
-                with replacing(camera, overwrite) as stream:
-                    stream.write(as_json([entry]).encode())
+                write_file(camera, as_json([entry]).encode(), overwrite)
         pictures = dict[str, Float[Tensor, "h w 3"] | str]()
         if program is not None or images is not None:
             with monitor.progress("drawing", "pictures") as tell:

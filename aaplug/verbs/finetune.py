@@ -24,7 +24,7 @@ from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
-from aaplug.io.atomic import AnyPath, check_output, replacing
+from aaplug.io.atomic import AnyPath, check_output, write_file
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, read_scene, write_scene, written_format
 from aaplug.methods.conversion import fuse_for
@@ -141,8 +141,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             report = evaluate(Task(candidates, scales, job.views, truth, ceiling=False), tell=tell)
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
-            with replacing(_beside(path, "json"), replaces) as stream:
-                stream.write(json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1).encode())
+            told = json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1)
+            write_file(_beside(path, "json"), told.encode(), replaces)
             sheet = sheet_of(truth, job.views[0], scales, candidates, "truth")
             write_png(_beside(path, "png"), sheet, overwrite=replaces)
             _beside(path, "pt").unlink(missing_ok=True)

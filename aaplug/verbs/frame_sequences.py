@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from aaplug.evaluation.journal import check_request
-from aaplug.io.atomic import check_output, refuse_existing, replacing
+from aaplug.io.atomic import check_output, refuse_existing, write_file
 from aaplug.io.video import CODECS
 from aaplug.system.errors import FormatError, OutputError, counted, listing
 from aaplug.verbs.views import SUFFIXES, names_image
@@ -94,6 +94,5 @@ class FrameSequence:
             if path.exists():
                 check_output(path, True)
                 path.unlink()
-        with replacing(self.record, True) as stream:
-            stream.write(json.dumps(now, indent=1).encode() + b"\n")
+        write_file(self.record, json.dumps(now, indent=1).encode() + b"\n", overwrite=True)
         return list(range(self.count))

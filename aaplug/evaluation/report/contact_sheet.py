@@ -71,12 +71,17 @@ def contact_sheet(
 
 
 def sheet_of(
-    truth: Truth, view: Camera, scales: Sequence[float], candidates: Sequence[Candidate], of: str, errors: bool = False
+    truth: Truth,
+    view: Camera,
+    scales: Sequence[float],
+    candidates: Sequence[Candidate],
+    heading: str,
+    errors: bool = False,
 ) -> Float[Tensor, "H W 3"]:
-    """A view at every scale: the truth `of` which the heading is, then each candidate; see `contact_sheet`."""
+    """A view at every scale: the truth under this heading, then each candidate under its name; see `contact_sheet`."""
     with torch.no_grad():
         rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
-    return contact_sheet((of, *(candidate.name for candidate in candidates)), rows, errors)
+    return contact_sheet((heading, *(candidate.name for candidate in candidates)), rows, errors)
 
 
 def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -16,7 +16,7 @@ from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.image_store import RENDERS, REPORT_FOLDER, TEST_FOLDER, TRUTHS, ImageStore
 from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.results import CEILING, Facts, Report, method
-from aaplug.io.atomic import make_folder, refuse_inputs, replacing
+from aaplug.io.atomic import make_folder, refuse_inputs, write_file
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
@@ -69,8 +69,7 @@ def write_page(
     beside = make_folder(Path(folder) / PLOTS)
     for plot in figures:
         for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
-            with replacing(beside / (plot.name + suffix), overwrite=True) as stream:
-                stream.write(data)
+            write_file(beside / (plot.name + suffix), data, overwrite=True)
     return [*paths, beside]
 
 
@@ -78,8 +77,7 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
     """Write texts, by file name, into a folder, which is made if needed; return the paths."""
     paths = [make_folder(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
-        with replacing(path, overwrite) as stream:
-            stream.write(text.encode(errors="backslashreplace"))  # a file's name need not be UTF-8
+        write_file(path, text.encode(errors="backslashreplace"), overwrite)  # a file's name need not be UTF-8
     return paths
 
 

@@ -135,7 +135,7 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
 
 
 def recognized(path: str | PathLike[str]) -> list[CameraFormat]:
-    """The formats of whose cameras there are some at this path, plug-ins first."""
+    """The formats that recognize cameras at this path, plug-ins first."""
     formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)
     return [each for each in formats if asked("camera format", each, "sniff", Path(path))]
 

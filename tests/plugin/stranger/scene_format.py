@@ -15,7 +15,6 @@ from aaplug import (
     Gaussians,
     Scene,
     SceneFileOptions,
-    check_count,
     library_errors,
     logit_of,
     replacing,
@@ -47,7 +46,6 @@ class Balls:
             rows = torch.from_numpy(np.loadtxt(path, dtype=np.float32, ndmin=2))
         if rows.shape[1] != COLUMNS:
             raise FormatError(path, f"has {rows.shape[1]} numbers per line instead of {COLUMNS}")
-        check_count(path, len(rows))
 
         def load(start: int, stop: int) -> Gaussians:
             return _gaussians(rows[start:stop])
