@@ -15,7 +15,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import quats_of, rotation_matrices
+from aaplug.core.projection import project, quats_of, rotation_matrices
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
@@ -226,6 +226,14 @@ def test_rotations_become_quaternions_again():
     scene = make_scene(50, dtype=torch.float64)
     again = quats_of(rotation_matrices(scene.unit_quats))
     torch.testing.assert_close((again * scene.unit_quats).sum(dim=1).abs(), torch.ones(50, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("place", "eye"), [(1, (-1000.0, 0.0, 0.0)), (2, (0.0, -1000.0, 0.0))])  # across x and y
+def test_areas_are_those_of_splats_seen_along_an_axis_from_far_away(place, eye):
+    scene, camera = make_scene(5, dtype=torch.float64), make_camera(eye, (64, 64))
+    scene.means[:] = 0
+    expected = 2 * math.pi * project(scene, camera).dets.sqrt() * (1000 / camera.fx) ** 2
+    torch.testing.assert_close(areas(covariances(scene))[:, place], expected, rtol=1e-3, atol=0)
 
 
 def test_one_lighter_scene(cli):
