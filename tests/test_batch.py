@@ -288,3 +288,7 @@ def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, output
     batch.refused(f"{verb} --batch many.toml -o out")  # nothing is replaced unasked
     code, out, _ = batch(f"{verb} --batch many.toml -o out --resume --json")
     assert [facts["status"] for facts in json.loads(out)["scenes"].values()] == ["kept", "kept", "failed"]
+    if (levels := Path("out/wide/lod.json")).exists():
+        levels.write_text("{")
+        code, out, _ = batch(f"{verb} --batch many.toml -o out --resume --json")
+        assert [facts["status"] for facts in json.loads(out)["scenes"].values()] == ["kept", "failed", "failed"]

@@ -317,8 +317,10 @@ def is_made(output: Path, options: LodOptions) -> bool:
         return output.is_file()
     if options.to is not None:
         return (output / STREAMS[options.to].index).exists()
-    made = pyramid_folder.is_pyramid(output) and pyramid_folder.read_manifest(output, unfinished=True).levels
-    return bool(made) and len(made) > (options.levels or DEFAULT_LEVELS)
+    with suppress(FormatError):  # making them tells what is damaged
+        made = pyramid_folder.read_manifest(output, unfinished=True).levels
+        return len(made) > (options.levels or DEFAULT_LEVELS)
+    return False
 
 
 def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[list[Path], list[Path]]:
