@@ -110,6 +110,7 @@ shuffled = random.Random(0).sample(
     [*File().columns, ("uchar", "red"), ("double", "weight"), ("short", "id"), ("int32", "class")],
     len(File().columns) + 4,
 )
+byte_last = File(columns=[*File().columns, ("uchar", "red")])  # its rows have an odd number of bytes
 box = ["element chunk 2", "comment of a chunk", "property float lo", "property uchar hi"]
 faces = ["element face 2", "property list uchar int vertex_indices", "property int flags"]
 face_rows = b"\x03" + bytes(range(12)) + bytes(4) + b"\x00" + bytes(4)
@@ -118,6 +119,7 @@ ROUND_TRIPS = {
     "plain": File(),
     "no rows": File(n=0, count="0"),
     "odd order and types": File(columns=shuffled),
+    "one row, a byte last": replace(byte_last, n=1, count="1"),
     "comments": File(top=[*tagged, " ", "comment last"]),
     "element before": File(before=(box, bytes(range(10)))),
     "element after": File(after=(box, bytes(range(10)))),
@@ -407,8 +409,8 @@ def coded(folder: Path, file: File, order: str) -> Path:
 @pytest.mark.parametrize("order", [">", "text"])
 @pytest.mark.parametrize(
     "file",
-    [filtered("hello"), File(columns=shuffled, before=(box, bytes(range(10))), after=(faces, face_rows))],
-    ids=["filtered", "tables"],
+    [filtered("hello"), byte_last, File(columns=shuffled, before=(box, bytes(range(10))), after=(faces, face_rows))],
+    ids=["filtered", "byte last", "tables"],
 )  # fmt: skip
 def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: str):
     path = coded(tmp_path, file, order)

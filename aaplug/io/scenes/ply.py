@@ -177,7 +177,8 @@ def _part(document: Document, degree: int, flat: bool, start: int, stop: int) ->
 
 def _matrix(rows: np.ndarray, names: Sequence[str]) -> Float[Tensor, "n c"]:
     """Columns as float32, without a copy if they are that and follow each other."""
-    return torch.from_numpy(np.ascontiguousarray(structured_to_unstructured(rows[[*names]], np.float32)))
+    matrix = structured_to_unstructured(rows[[*names]], np.float32)
+    return torch.from_numpy(matrix.ravel().reshape(matrix.shape))  # of one row or none, ravel takes the odd stride away
 
 
 def _plain_header(scene: Gaussians) -> Header:
