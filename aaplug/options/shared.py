@@ -81,7 +81,7 @@ def check_side(where: str, width: int, height: int) -> None:
 def _check_colour(text: str, where: str) -> None:
     """Refuse what is no colour; the module that knows colours imports torch, so it waits for one to be given."""
     if text == "transparent":
-        raise UsageError(where, "takes auto or an opaque colour; `transparent` is for images without one")
+        raise UsageError(where, "takes auto or an opaque colour; for none, render and video have `transparent`")
     if text != "auto":
         import_module("aaplug.io.images").colour_of(text, where)
 
