@@ -18,6 +18,7 @@ from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.photos import without_suffix
+from aaplug.io.cameras.poses import inverse
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
@@ -198,6 +199,12 @@ def test_inria_names_what_is_wrong(tmp_path, change, message):
         read_cameras(folder)
     else:
         refused(folder, "cameras.json", message)
+
+
+def test_the_inverse_of_a_pose_does_not_depend_on_its_layout_in_memory():
+    pose = make_camera((1.3, -4.1, 0.7)).cam_from_world
+    pose[:3, 3] = torch.tensor([1.3, -4.1, 0.7])
+    assert inverse(pose).equal(inverse(pose.T.contiguous().T))
 
 
 def test_rotation_is_made_orthonormal(tmp_path):

@@ -35,7 +35,7 @@ def pose(
 
 def inverse(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """The inverse of a rigid motion."""
-    back = motion[:3, :3].T
+    back = motion[:3, :3].T.contiguous()  # its layout decides how products are rounded
     return rigid_motion(back, -back @ motion[:3, 3])
 
 
