@@ -312,7 +312,7 @@ def _source(maker: _Maker) -> str:
 
 
 def is_made(output: Path, options: LodOptions) -> bool:
-    """Whether all that the options ask for is in the output."""
+    """True if the output is complete: all files that the options ask for, or a stream of any number of levels."""
     if options.single:
         return output.is_file()
     if options.to is not None:
