@@ -12,6 +12,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jaxtyping
@@ -33,7 +34,11 @@ from tests.work import refuse_three
 
 
 @pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
-def test_results_come_in_order_until_the_first_error(executor):
+def test_results_come_in_order_until_the_first_error(executor, tmp_path, monkeypatch):
+    script = ModuleType("__main__")
+    script.__file__ = str(tmp_path / "without_guard.py")
+    Path(script.__file__).write_text("raise SystemExit")  # as it would run again in each process
+    monkeypatch.setitem(sys.modules, "__main__", script)
     results = []
     with pytest.raises(FormatError) as error:
         results.extend(executor.map(refuse_three, range(6)))

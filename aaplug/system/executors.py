@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -18,6 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -71,7 +73,8 @@ class Processes:
     """Fresh (spawned) processes, each with one torch thread.
 
     `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
-    through pipes.  A script that uses processes needs `if __name__ == "__main__":` around its calls.
+    through pipes.  A script whose own classes or functions are part of `work` is imported by each process, so it needs
+    `if __name__ == "__main__":` around its calls.
 
     ordered: true for results in the order of the items, false for results as they finish.
     """
@@ -89,8 +92,8 @@ class Processes:
         with scratch() as folder:
             save(work, folder / WORK_FILE_NAME)
             track_quietly()
-            spawn = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(self.workers, spawn, _start, (str(folder),))
+            context = SpawnContext() if needs_script(folder / WORK_FILE_NAME) else _WithoutScript()
+            pool = ProcessPoolExecutor(self.workers, context, _start, (str(folder),))
             try:
                 most = ITEMS_PER_WORKER * self.workers
                 yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
@@ -107,6 +110,23 @@ class Processes:
                 ) from error
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+class _ScriptlessProcess(SpawnProcess):
+    """A spawned process that does not import the program's script, which would start the program again."""
+
+    def start(self) -> None:
+        main = vars(sys.modules["__main__"])
+        script = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+        main.update(dict.fromkeys(script))  # where multiprocessing finds the script
+        try:
+            super().start()
+        finally:
+            main.update(script)
+
+
+class _WithoutScript(SpawnContext):
+    Process = _ScriptlessProcess
 
 
 @dataclass(frozen=True)
@@ -197,6 +217,12 @@ def save(work: object, path: Path) -> None:
         if cause := of_system(error):
             raise OutputError(path, f"cannot be written: {reason(cause)}") from error
         raise
+
+
+def needs_script(path: Path) -> bool:
+    """Whether what `save` wrote names something of the program's script."""
+    with zipfile.ZipFile(path) as archive:
+        return any(b"__main__" in archive.read(name) for name in archive.namelist() if name.endswith("/data.pkl"))
 
 
 def load(path: str | Path) -> Callable[[Any], Any]:
