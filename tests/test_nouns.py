@@ -61,6 +61,16 @@ def test_a_printed_scene_says_what_it_is_and_leaves_out_what_its_writer_needs(tm
         assert "f_dc_0" not in printed
 
 
+def test_what_is_printed_of_cameras_and_of_a_renderer_does_not_grow_with_them():
+    few, many = (CameraSet(VIEWS[:1] * n, VIEWS[1:] * n, notes=("COLMAP",)) for n in (10, 99))
+    assert repr(few).replace("10", "99") == repr(many)
+    assert "COLMAP" in repr(many)
+    few, many = (Renderer.of(make_scene(n), cameras, "classic") for n, cameras in ((10, few), (99, many)))
+    assert len(repr(many)) == len(repr(few))
+    assert "count=99" in repr(many)
+    assert "name='classic'" in repr(many)
+
+
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
 @pytest.mark.parametrize("held", [SCENE, PYRAMID, "file"], ids=["Gaussians", "levels", "file"])
 def test_a_copy_of_a_scene_holds_its_rows_and_equals_itself_alone(held, copied, tmp_path):

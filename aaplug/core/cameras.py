@@ -255,6 +255,10 @@ class CameraSet:
         for name in ("train", "test", "notes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
+    def __repr__(self) -> str:
+        found = f"{len(self.train)} train, {len(self.test)} test, background={self.background}, notes={self.notes}"
+        return f"CameraSet({found}, assumed={self.assumed})"
+
     @property
     def all(self) -> tuple[Camera, ...]:
         """Every camera once, training views first."""

@@ -83,14 +83,14 @@ class Renderer:
     in_time: the frames of a scene in time, of which `scene` is the first; else None.
     """
 
-    scene: Gaussians
-    training: TrainingViews
+    scene: Gaussians = field(repr=False)
+    training: TrainingViews = field(repr=False)
     recipe: Recipe
     rasterizer: Rasterizer = RASTERIZERS["eager"]
     background: Colour = BLACK
     harmonics: Harmonics | None = None
-    cutter: Cutter | None = None
-    source: Scene | None = field(default=None, repr=False)
+    cutter: Cutter | None = field(default=None, repr=False)
+    source: Scene | None = None
     in_time: SceneFrames | None = None
     _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False)
     _open: dict[int, "Renderer"] = field(default_factory=dict, init=False, repr=False)  # of the last frame drawn
