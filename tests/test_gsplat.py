@@ -436,7 +436,9 @@ def test_gradient_of_a_disc_is_that_of_its_move_across_the_image(packed):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_odd_discs_have_finite_images_and_gradients(dtype):
+def test_odd_discs_have_finite_images_and_gradients(dtype, caplog):
+    """Their distortion is drawn in float64, but only what the caller chose is told to be slow."""
+    rasterizer_of.cache_clear()
     values, view = discs(), cameras([make_camera((0.0, -3.0, 0.0), SIZE)])
     values["means"][:4] = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, -2.9, 0.0], [0.0, 9.0, 0.0]])
     values["quats"][:4], values["opacities"][4] = torch.tensor([1.0, 0.0, 0.0, 0.0]), 0.0  # flat before the camera
@@ -445,6 +447,7 @@ def test_odd_discs_have_finite_images_and_gradients(dtype):
     leaves = [x.requires_grad_() for x in values.values()]
     *results, meta = rasterization_2dgs(**values, **view, render_mode="RGB+ED", distloss=True)
     assert meta["radii"][0, 0].min() == 1, "this disc should be seen from its edge"
+    assert ("float64 is drawn eagerly" in caplog.text) == (dtype is F64)
     for gradient in torch.autograd.grad(sum(x.square().sum() for x in results), leaves):
         assert gradient.isfinite().all()
     values["means"] = values["means"] - 100  # out of sight

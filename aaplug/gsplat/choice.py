@@ -1,5 +1,6 @@
 """The rasterizer that a call asks for."""
 
+import logging
 from dataclasses import replace
 from functools import cache
 
@@ -14,10 +15,14 @@ from aaplug.rasterizers.tiled.on_demand import BUILT_BY_NAME
 from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError
 
+log = logging.getLogger("aaplug")
+
 
 @cache
-def rasterizer_of(name: str) -> Rasterizer:
-    """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
+def rasterizer_of(name: str, precision: torch.dtype) -> Rasterizer:
+    """A rasterizer by name for what a program draws; kernels are loaded and checked once, not for every image."""
+    if (name, precision) == ("auto", torch.float64):
+        log.warning("float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast")
     found = find_rasterizer(name, None)
     if name != "compiled":
         return found

@@ -11,9 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from functools import cache
 
-import torch
 from torch import Tensor
 
 from aaplug.core.kernels import Kernel, Runner
@@ -51,8 +49,6 @@ class OnDemandKernels(CompiledKernels):
         """The function that runs one stage for such arguments."""
         if time.monotonic() > self._next_look:
             self._look()
-        if args[0].dtype is torch.float64:
-            _tell_of_double()
         runner = super().runner(kernel, args)
         if self._missing and self._next_look == math.inf:
             self._next_look = time.monotonic() + PATIENCE_SECONDS
@@ -86,8 +82,3 @@ class OnDemandKernels(CompiledKernels):
             self._missing -= self._tried
             atexit.unregister(self._compiler.terminate)
             self._compiler, self._next_look = None, math.inf
-
-
-@cache
-def _tell_of_double() -> None:
-    log.warning("float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast")
