@@ -33,6 +33,14 @@ from tests.conftest import ROOT, SAMPLE, exit_code, make_camera, make_scene, run
 from tests.work import refuse_three
 
 
+def test_what_a_notebook_defines_is_done_without_processes(monkeypatch):
+    """No other process could import it."""
+    notebook = ModuleType("__main__")
+    exec("import os\ndef where(item): return item, os.getpid()", vars(notebook))
+    monkeypatch.setitem(sys.modules, "__main__", notebook)
+    assert [*Processes(2).map(notebook.where, range(3))] == [(item, os.getpid()) for item in range(3)]
+
+
 @pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
 def test_results_come_in_order_until_the_first_error(executor, tmp_path, monkeypatch):
     script = ModuleType("__main__")

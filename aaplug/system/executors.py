@@ -74,7 +74,8 @@ class Processes:
 
     `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
     through pipes.  A script whose own classes or functions are part of `work` is imported by each process, so it needs
-    `if __name__ == "__main__":` around its calls.
+    `if __name__ == "__main__":` around its calls.  What a notebook defines no other process can import, so that such
+    work is done in this one.
 
     ordered: true for results in the order of the items, false for results as they finish.
     """
@@ -91,8 +92,12 @@ class Processes:
         """
         with scratch() as folder:
             save(work, folder / WORK_FILE_NAME)
+            needs = needs_script(folder / WORK_FILE_NAME)
+            if needs and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or ""):
+                yield from map(work, items)
+                return
             track_quietly()
-            context = SpawnContext() if needs_script(folder / WORK_FILE_NAME) else _WithoutScript()
+            context = SpawnContext() if needs else _WithoutScript()
             pool = ProcessPoolExecutor(self.workers, context, _start, (str(folder),))
             try:
                 most = ITEMS_PER_WORKER * self.workers
