@@ -24,6 +24,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
+from aaplug.core.runs import starts_of
 
 VERSION = 1
 CHUNK_GAUSSIANS = 1 << 16
@@ -80,7 +81,7 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
     scene = joined([scene, replace(above, means=means[len(scene) :], **shape)])
     counts = torch.bincount(parents + 1, minlength=len(scene) + 1)[1:]
     siblings = torch.argsort(parents, stable=True)  # first the root, then the children of each
-    firsts = 1 + counts.cumsum(0) - counts  # among the siblings
+    firsts = 1 + starts_of(counts)  # among the siblings
     order, starts, below = [siblings[:1]], list[Tensor](), 1
     while len(order[-1]):  # the root, its children, theirs
         count = counts[order[-1]]

@@ -16,6 +16,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
 from aaplug.core.projection import quats_of
 from aaplug.core.rules import RULES_3DGS
+from aaplug.core.runs import starts_of
 from aaplug.core.sampling import median_rates
 from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, unpack
 from aaplug.system.errors import FrameError, counted
@@ -161,7 +162,7 @@ def gaussians_of(clusters: Clusters, scene: Gaussians, weights: Float[Tensor, " 
     """
     counts = torch.bincount(clusters.labels, minlength=len(clusters))
     order = torch.argsort(clusters.labels, stable=True)
-    first = order[counts.cumsum(0) - counts]
+    first = order[starts_of(counts)]
     many = (counts > 1).nonzero()[:, 0]
     columns = {name: column[first] for name, column in scene.columns.items()}
     for name, values in _shapes(clusters[many], scene).items():

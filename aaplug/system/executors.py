@@ -225,7 +225,7 @@ def save(work: object, path: Path) -> None:
 
 
 def needs_script(path: Path) -> bool:
-    """Whether what `save` wrote names something of the program's script."""
+    """True if what `save` wrote names something of the program's script."""
     with zipfile.ZipFile(path) as archive:
         return any(b"__main__" in archive.read(name) for name in archive.namelist() if name.endswith("/data.pkl"))
 

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
@@ -177,6 +176,8 @@ def _part(document: Document, degree: int, flat: bool, start: int, stop: int) ->
 
 def _matrix(rows: np.ndarray, names: Sequence[str]) -> Float[Tensor, "n c"]:
     """Columns as float32, without a copy if they are that and follow each other."""
+    from numpy.lib.recfunctions import structured_to_unstructured  # 15 ms that every verb would start later
+
     matrix = structured_to_unstructured(rows[[*names]], np.float32)
     return torch.from_numpy(matrix.ravel().reshape(matrix.shape))  # of one row or none, ravel takes the odd stride away
 
