@@ -224,7 +224,8 @@ class Command:
             else:
                 several = option and option.argument and option.argument.count is None
                 (files if several and FILE.fullmatch(word) else others).append(word)
-        box, config = StringIO(), (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+        box, conf = StringIO(), tyro.conf
+        config = conf.OmitArgPrefixes, conf.FlagCreatePairsOff, conf.HelptextFromCommentsOff
         how = {"prog": f"aaplug {self.name}", "args": [*files, *others], "config": config}
         try:
             with redirect_stderr(box):

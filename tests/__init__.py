@@ -1,57 +1,59 @@
 """Tests, and how they check the types and shapes of what aaplug's functions take and return, by jaxtyping and beartype.
 
-Checks took half of the time of all tests.  So those of functions inside functions are left out, which would be compiled
-at every call of the outer one, and in each test the first `CHECKS_OF_EACH` of a function are made, and `MOST_CHECKS` in
-all.
+Checks took half of the time of all tests.  So functions inside functions are left out, whose checks would be compiled
+at every call of the outer one, and each test checks the first `CHECKED_CALLS` of a function.
 
 Tests run side by side, so they and the programs that they start have one thread, and threads that wait do not spin.
 """
 
 import ast
+import inspect
 import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import jaxtyping
 
-CHECKS_OF_EACH = 50  # of what a function takes or gives
-MOST_CHECKS = 10_000  # twice as many as calls
+CHECKED_CALLS = 3
 
 if "pytest" in sys.modules:  # benches measure without these; torch reads them when it is imported, after this
     os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 _test = 0
-_left = MOST_CHECKS
 
 
 def check_again() -> None:
-    """Make the checks of another test."""
-    global _test, _left
-    _test, _left = _test + 1, MOST_CHECKS
-    jaxtyping.config.update("jaxtyping_disable", False)
+    """Check the calls of another test."""
+    global _test
+    _test += 1
 
 
-def with_checks(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with its checks: jaxtyping's own, which does nothing else."""
-    from beartype import beartype
+def limited(jaxtyped: Callable[..., Any]) -> Callable[..., Any]:
+    """jaxtyping's decorator, whose functions check their first calls in each test."""
 
-    check, test, left = None, 0, CHECKS_OF_EACH
+    def decorate(function: Callable[..., Any] | None = None, *, typechecker: Callable[..., Any]) -> Any:
+        if function is None:
+            return partial(decorate, typechecker=typechecker)
+        if not inspect.isfunction(function):
+            return jaxtyped(function, typechecker=typechecker)
+        checked, test, left = None, 0, 0
 
-    @wraps(function)
-    def call(*args: Any, **options: Any) -> Any:
-        global _left
-        nonlocal check, test, left
-        check = check or beartype(function)  # at the first call: most functions are called by few tests
-        if test != _test:
-            test, left = _test, CHECKS_OF_EACH
-        left, _left = left - 1, _left - 1
-        if not _left:
-            jaxtyping.config.update("jaxtyping_disable", True)
-        return check(*args, **options) if left >= 0 else None
+        @wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            nonlocal checked, test, left
+            if test != _test:
+                test, left = _test, CHECKED_CALLS
+            if not left:
+                return function(*args, **options)
+            left -= 1
+            checked = checked or jaxtyped(function, typechecker=typechecker)  # most functions are called by few tests
+            return checked(*args, **options)
 
-    return call
+        return call
+
+    return decorate
 
 
 def _leave_inner_functions_out() -> None:
@@ -68,3 +70,4 @@ def _leave_inner_functions_out() -> None:
 
 
 _leave_inner_functions_out()
+jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = limited(jaxtyping.jaxtyped)

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from jaxtyping import TypeCheckError
 
 from aaplug.core.cameras import CameraSet, look_at
 from aaplug.core.gaussians import Origin
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
+from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, scene_of, write_scene
 from aaplug.methods import RECIPES
@@ -173,3 +175,11 @@ def test_a_name_that_a_registry_lacks_is_a_key_error_and_ours():
             RECIPES["mipp"]
     assert RECIPES.get("mipp") is None
     assert pickle.loads(pickle.dumps(RECIPES)) is RECIPES
+
+
+@pytest.mark.parametrize("test", ["one", "another"])
+def test_shapes_are_checked_in_every_test(test):
+    with pytest.raises(TypeCheckError):
+        replace(make_splats(6, (8, 8)), depths=torch.zeros(5))
+    with pytest.raises(TypeCheckError):
+        sh_colour(torch.zeros(6, 4, 3), torch.zeros(5, 3))
