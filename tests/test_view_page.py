@@ -40,7 +40,7 @@ def seen(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def address(seen):
-    with serving(*seen, port=0, rasterizer="eager", words=("scene.ply", "--cameras", "a b")) as address:
+    with serving(*seen, port=0, words=("scene.ply", "--cameras", "a b")) as address:
         yield address
 
 
@@ -154,7 +154,7 @@ def test_a_streamed_picture_is_the_library_s_own(opened, seen):
     at_rest(page, at="", split="1.000")
     camera = camera_of(page)
     for recipe, flipped in (("classic", "0.000"), ("auto", "1.000")):
-        expected = Renderer.of(*seen, recipe, quality="best", rasterizer="eager")(camera).rgb
+        expected = Renderer.of(*seen, recipe, quality="best")(camera).rgb
         enlarged = image(page).permute(2, 0, 1)[None]
         small = torch.nn.functional.interpolate(enlarged, camera.hw, mode="nearest-exact")[0].permute(1, 2, 0)
         inside = slice(4, camera.width - 4)  # the divider stands at an edge
@@ -213,7 +213,7 @@ def test_it_opens_where_both_sides_differ_most_and_says_what_to_look_at(opened, 
     for index, view in enumerate(seen[1].train):
         for scale in (0.125, 0.25, 0.5):
             images = [
-                quantised(Renderer.of(*seen, recipe, quality="best", rasterizer="eager")(view.scaled(scale)).rgb)
+                quantised(Renderer.of(*seen, recipe, quality="best")(view.scaled(scale)).rgb)
                 for recipe in ("classic", "auto")
             ]
             apart[str(index), str(scale)] = psnr(*images) or math.inf
@@ -295,7 +295,7 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     one.reload()
     at_rest(one)
     assert state(one)["pose"] == state(two)["pose"]  # the server's scene, without the camera of the other
-    with serving(tmp_path / name, seen[1], port=0, rasterizer="eager") as address:
+    with serving(tmp_path / name, seen[1], port=0) as address:
         three = opened(where=address, as_opened=True)
         three.evaluate(drop, other)
         three.locator("#said", has_text=f"opened {name}").wait_for()  # of the same name and count, but without cameras
@@ -431,7 +431,7 @@ def test_the_copied_command_draws_what_was_seen(opened, cli, at):
     name = "it's a “$scene`.ply"
     Path("scene.ply").rename(name)
     words = (name, "--cameras", ".")
-    with serving(name, ".", port=0, rasterizer="eager", words=words) as where:
+    with serving(name, ".", port=0, words=words) as where:
         page = opened(where, size=(1003, HEIGHT), permissions=["clipboard-read", "clipboard-write"])
         page.keyboard.press("3")  # 1/2
         page.fill("#background", "#204060")
@@ -450,7 +450,7 @@ def test_the_copied_command_draws_what_was_seen(opened, cli, at):
     program, *rest = shlex.split(command)
     assert program == "aaplug"
     with pytest.raises(SystemExit, match="0"):
-        main([*rest, "--rasterizer", "eager"])
+        main(rest)
     drawn = read_image("view.png")
     assert (drawn.shape[1], drawn.shape[0]) == size
     small = torch.nn.functional.interpolate(shown.permute(2, 0, 1)[None], drawn.shape[:2], mode="nearest-exact")[0]
@@ -472,14 +472,14 @@ def test_two_pages_shake_at_once_and_one_may_close(opened):
 
 
 def test_a_lost_page_finds_its_server_again(opened, seen):
-    with serving(*seen, port=0, rasterizer="eager") as first:
+    with serving(*seen, port=0) as first:
         page = opened(where=first)
         drag(page, (0.2, 0.5), (0.3, 0.5))
         at_rest(page, at="")
         pose = ASKED[page]["pose"]
     page.wait_for_selector("#lost:not([hidden])")
     port = int(first.split(":")[2].strip("/"))
-    with serving(*seen, port=port, rasterizer="eager"):
+    with serving(*seen, port=port):
         page.wait_for_selector("#lost", state="hidden")
         page.keyboard.press("3")
         at_rest(page, at="", scale="0.5")

@@ -73,7 +73,7 @@ def test_a_message_out_of_bounds_is_refused_in_clear_words(name):
 
 @pytest.fixture(scope="module")
 def address(seen):  # noqa: F811
-    with serving(*seen, port=0, rasterizer="eager") as address:
+    with serving(*seen, port=0) as address:
         yield address
 
 
@@ -130,7 +130,7 @@ def test_a_websocket_of_another_page_is_refused(address, origin):
 
 def test_a_network_address_asks_for_its_token(seen):  # noqa: F811
     exceptions = pytest.importorskip("websockets.exceptions")
-    with serving(*seen, host="0.0.0.0", port=0, rasterizer="eager") as address:
+    with serving(*seen, host="0.0.0.0", port=0) as address:
         assert "//0.0.0.0" not in address  # which some systems do not open, and no other machine
         local = address.replace(socket.gethostname(), "127.0.0.1")
         bare, _, token = local.partition("?")
@@ -153,7 +153,7 @@ def test_a_page_that_asks_without_reading_is_cut_off(seen, monkeypatch):  # noqa
         await asyncio.Event().wait()
 
     monkeypatch.setattr("aaplug.live.server._send_all", never_sends)
-    with serving(*seen, port=0, rasterizer="eager") as address, connected(address) as bad:
+    with serving(*seen, port=0) as address, connected(address) as bad:
         bad.recv()
 
         def ask_on():
@@ -217,7 +217,7 @@ def test_a_busy_port_is_one_clear_line(address, cli):
 
 
 def test_a_host_that_cannot_be_a_name_is_refused(seen):  # noqa: F811
-    with pytest.raises(UsageError, match="cannot be used"), serving(*seen, host=70 * "x", rasterizer="eager"):
+    with pytest.raises(UsageError, match="cannot be used"), serving(*seen, host=70 * "x"):
         pass
 
 
@@ -240,7 +240,7 @@ def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
 def test_without_a_scene_the_sample_opens(monkeypatch):
     opened = []
     monkeypatch.setattr("aaplug.verbs.view.attend", lambda address, *_: opened.append(address))
-    view(port=0, rasterizer="eager")
+    view(port=0)
     assert opened[0].startswith("http://127.0.0.1:")
 
 
