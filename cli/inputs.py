@@ -9,7 +9,7 @@ import aaplug
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.options.base import CAMERAS, Group, Options, flag, names, number
 from aaplug.options.shared import SCALE, Orbit
-from aaplug.system.errors import UsageError, counted
+from aaplug.system.errors import FormatError, UsageError, counted
 
 from .console import TERMINAL, say
 from .words import Words
@@ -77,6 +77,8 @@ def path_of(words: Words) -> Path:
 def open_scene(words: Words, path: Path | None = None) -> "Scene":
     """Open the scene that the words name, or one at a path, and say what it is."""
     path = path or path_of(words)
+    if not path.exists():  # told before torch is imported
+        raise FormatError(path, "cannot be read: no such file")
     from aaplug.methods.conversion import describe
 
     how: dict[str, Any] = words.keywords(FileOptions) | {"iteration": words.values.get("iteration")}

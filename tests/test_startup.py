@@ -50,6 +50,7 @@ MISTAKES = [
     *("finetune s.ply -o t.ply --for web", "finetune s.ply -o t.ply --loss l3", "finetune s.ply -o t.ply --method m"),
     *("compare a.ply b.ply --for web", "compare a.ply b.ply --for spark --recipe mip", "lod s.ply -o l --scale 0.5"),
     *("render s.ply -o out --orbit 2 --eye 1 2 3", "bench --rasterizer fast"),
+    *("info no.ply", "render no.ply -o out", "merge no.ply one.ply -o m.ply"),
 ]
 
 
