@@ -3,10 +3,12 @@
 import csv
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import pytest
 import torch
 
@@ -288,6 +290,13 @@ def test_under_each_picture_stands_its_psnr_against_the_first_of_its_row(texts):
     contact_sheet(("truth", "same", "other"), [(0.5, images), (0.25, images)], errors=True)
     assert texts[:5] == ["truth", "same", "error", "other", "error"]
     assert texts[5:] == ["1/2: 6x5", "equal", "28.13 dB", "1/4: 6x5", "equal", "28.13 dB"]
+
+
+def test_a_heading_is_no_wider_than_its_picture(texts):
+    image = torch.zeros(5, 5, 3)
+    contact_sheet(("truth", f"a{'x' * 99}z"), [(1.0, (image, image))])
+    assert re.fullmatch(r"ax{9,}\.\.\.x{9,}z", texts[1])
+    assert cv2.getTextSize(texts[1], cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0] <= 320
 
 
 def test_an_error_map_runs_from_black_to_the_end_of_the_scale():

@@ -85,6 +85,17 @@ def test_curves_of_many_recipes_differ_in_colour_or_marker(written):
     assert len(looks) == len(axes.lines) == 36
 
 
+def test_the_legend_names_each_curve_in_the_width_of_the_plot(written):
+    _, report, found = written
+    names = {"classic": "_" + "x" * 300 + "_1", "auto": "_" + "x" * 300 + "_2"}
+    renamed = [replace(m, recipe=names.get(m.recipe, m.recipe)) for m in report.measurements]
+    axes = plots(replace(report, measurements=tuple(renamed)), found)[0].draw("black").axes[0]
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert [text[-2:] for text in texts[:2]] == ["_1", "_2"]
+    assert len(texts) == len(axes.lines)
+    assert max(map(len, texts)) <= 60
+
+
 def test_tables_show_the_spread_and_the_worst_view_and_times_their_quartiles(written):
     folder, report, _ = written
 
@@ -294,13 +305,19 @@ def test_an_address_of_a_section_or_of_nonsense_does_no_harm(opened):
         assert (data(page, "shown"), data(page, "lens"), data(page, "split")) == (usual, "off", "0.500")
 
 
-def test_tables_of_long_names_are_whole_on_a_desktop(browser, tmp_path, plots_drawn_once):
-    scenes = {f"a_scene_whose_name_is_as_long_as_{name}.ply": make_scene(150, seed) for seed, name in enumerate("abc")}
+def test_long_names_are_whole_on_a_desktop(browser, tmp_path, plots_drawn_once):
+    scenes = {f"a_scene_whose_name_is_as_long_as_{name}.ply": make_scene(150, seed) for seed, name in enumerate("ab")}
+    scenes["x" * 200] = make_scene(150, 2)
     views = tuple(make_camera((place, -4.0, 1.0), name=f"view_at_{place}_metres") for place in (0.0, 2.0))
     compare(scenes, CameraSet(views, views), tmp_path, metric="psnr", rasterizer="eager", any_frame=True)
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((tmp_path / "report.html").as_uri())
     assert page.evaluate("[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)")
+    choose(page, *list(scenes)[1:])
+    page.wait_for_function("document.querySelector('#stage .labels').lastChild.textContent.startsWith('x')")
+    assert page.evaluate("document.documentElement.scrollWidth") == 1280
+    line, label = (page.locator(f"#stage .labels{part}").bounding_box() for part in ("", " span >> nth=0"))
+    assert label["width"] > 0.4 * line["width"]
     page.close()
 
 

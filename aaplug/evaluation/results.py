@@ -166,6 +166,12 @@ def spread_of(metric: Metric, measurements: Iterable[Measurement]) -> Spread | N
     return Spread(sum(values.values()) / len(values), median(values.values()), (worst, values[worst]), deviation)
 
 
+def elided(text: str, most: int) -> str:
+    """The text without its middle where it has more than `most` characters: names differ at their ends."""
+    tail = (most - 1) // 2
+    return text if len(text) <= most else f"{text[: most - 1 - tail]}…{text[len(text) - tail :]}"
+
+
 def scale_name(scale: float) -> str:
     """A scale in words: 1/4, 1, 2×, 0.3."""
     if scale > 1:

@@ -17,7 +17,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.imaging import levels, quantised
 from aaplug.evaluation.engine import Candidate
 from aaplug.evaluation.metrics import PSNR, psnr
-from aaplug.evaluation.results import scale_name
+from aaplug.evaluation.results import elided, scale_name
 from aaplug.evaluation.truth import Truth
 
 CELL_HEIGHT = 320  # px
@@ -58,8 +58,8 @@ def contact_sheet(
     *lefts, total = accumulate((w + GAP for w in widths), initial=margin)
     row_height = CELL_HEIGHT + HEADING
     sheet = np.full((HEADING + len(rows) * row_height, total, 3), 255, dtype=np.uint8)
-    for left, heading in zip(lefts, headings, strict=True):
-        _write(sheet, heading, left, HEADING - GAP)
+    for left, room, heading in zip(lefts, widths, headings, strict=True):
+        _write(sheet, _fitting(heading, room), left, HEADING - GAP)
     for top, (label, cells) in zip(count(HEADING, row_height), sheet_rows, strict=False):
         _write(sheet, label, GAP, top + CELL_HEIGHT // 2)
         for left, room, (image, caption) in zip(lefts, widths, cells, strict=True):
@@ -147,6 +147,11 @@ def _in_font(text: str) -> str:
 
 def _text_width(text: str) -> int:
     return cv2.getTextSize(_in_font(text), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
+
+
+def _fitting(text: str, room: int) -> str:
+    """The text, without its middle where it is wider than so many px."""
+    return next((short for n in range(len(text), 1, -1) if _text_width(short := elided(text, n)) <= room), text[:1])
 
 
 def _write(sheet: np.ndarray, text: str, left: int, bottom: int, ink: tuple[int, int, int] = INK) -> None:

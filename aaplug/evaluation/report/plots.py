@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter
 
 from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations, scale_name
+from aaplug.evaluation.results import CEILING, Report, elided, mean, million_evaluations, scale_name
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
 COLOURS = ("#3b82f6", "#d97706", "#16a34a", "#db2777", "#8b5cf6", "#0d9aa8", "#a3713d", "#7b8794")
@@ -27,6 +27,7 @@ INK = "#010203"  # placeholder for the colour of the page's text, which is light
 PAPER_INK = "#1c2733"
 FIGURE_INCHES = (5.2, 3.3)
 DPI = 160  # of a PNG
+LEGEND_CHARACTERS = 60  # of a name: about the width of the plot
 EVALUATIONS, ABOVE_NYQUIST, BOUNDS = "evaluations", "above-nyquist", "sampling-bounds"  # names of plots
 INK_SETTINGS = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
 STYLE: dict[Any, Any] = {
@@ -123,7 +124,8 @@ def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool
         if from_zero:
             axes.set_ylim(bottom=0)
         columns = 3 if max(map(len, lines)) <= len(CEILING) else 1
-        axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns)
+        labels = [elided(str(line.get_label()), LEGEND_CHARACTERS) for line in axes.lines]
+        axes.legend(axes.lines, labels, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns)
         return figure
 
     return Plot(name, f"{title} over scale, one line per recipe", draw)
