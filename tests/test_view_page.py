@@ -13,7 +13,7 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
-from aaplug.core.cameras import Camera, centred
+from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
@@ -126,6 +126,10 @@ def image(page, selector=SEEN) -> torch.Tensor:
     """The pixels of a canvas themselves."""
     url = page.evaluate("(s) => document.querySelector(s).toDataURL()", selector)
     return decoded(b64decode(url.partition(",")[2]))
+
+
+def groups_of_views(page) -> list[str]:
+    return page.evaluate("[...document.querySelectorAll('#view optgroup')].map((group) => group.label)")
 
 
 def drag(page, start, end, button="left"):
@@ -284,10 +288,17 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     other = [name, b64encode((tmp_path / name).read_bytes()).decode()]
     one.evaluate(drop, ["bad.ply", b64encode(b"no scene").decode()])
     one.locator("#said", has_text="bad.ply").wait_for()
+    record = one.locator("#record")
+    click(record)
+    one.locator("#path", has_text="(").wait_for()
     one.evaluate(drop, other)
     one.locator("#said", has_text=f"opened {name}").wait_for()
     at_rest(one)
     assert one.inner_text("#facts").startswith("70 Gaussians")
+    assert groups_of_views(one) == ["orbit", "assumed training"]
+    assert not record.is_checked()
+    assert one.inner_text("#path") == "Save path"  # that of the other scene is forgotten
+    assert one.locator("#path").is_disabled()
     assert two.inner_text("#facts").startswith("200 Gaussians")
     one.select_option("#view", "0")
     at_rest(one, at="0")
@@ -295,8 +306,10 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     one.reload()
     at_rest(one)
     assert state(one)["pose"] == state(two)["pose"]  # the server's scene, without the camera of the other
-    with serving(tmp_path / name, seen[1], port=0) as address:
+    narrow = (make_camera((0.0, -400.0, 0.0), fov=0.01),)
+    with serving(tmp_path / name, CameraSet(narrow, narrow), port=0) as address:
         three = opened(where=address, as_opened=True)
+        assert camera_of(three).height <= 64 * float(data(three, "scale"))  # all of so narrow a view, and no more
         three.evaluate(drop, other)
         three.locator("#said", has_text=f"opened {name}").wait_for()  # of the same name and count, but without cameras
         assert "training rate assumed" in three.inner_text("#facts")
@@ -328,6 +341,7 @@ def test_the_scale_sets_the_size_in_pixels(opened, seen):
     page = opened()
     click(page.locator("#scales input").nth(2))  # 1/2
     at_rest(page, scale="0.5")
+    assert page.get_attribute("#scale", "aria-valuetext") == "1/2"
     camera = camera_of(page)
     assert camera.focal == 0.5 * seen[1].train[0].focal
     assert camera.height == pytest.approx(2 * camera.focal * math.tan(math.radians(state(page)["fov"] / 2)), abs=1)
@@ -359,11 +373,13 @@ def test_one_stands_in_cameras_and_sees_their_photographs(opened, seen):
     page = opened()
     assert page.input_value("#view") == "0"
     page.fill("#fade", "1")
+    assert page.locator("#names").inner_text().strip() == "photograph"
     values = data(page, "psnr").split(",")
     assert len(values) == 2
     assert f"{float(values[0]):.2f} dB" in page.inner_text("#psnr")
     faded = image(page)
     page.fill("#fade", "0")
+    assert page.inner_text("#name-0") == "classic"
     assert not torch.equal(image(page), faded)
     page.keyboard.press("5")  # 2, larger than the photograph
     at_rest(page, scale="2", psnr="")
@@ -372,6 +388,7 @@ def test_one_stands_in_cameras_and_sees_their_photographs(opened, seen):
     at_rest(page, at="1")
     assert page.inner_text("#psnr") == ""
     assert page.locator("#view option:checked").inner_text() == "<i>1"
+    assert groups_of_views(page) == ["training"]  # none is held out
     page.keyboard.press("c")
     for _ in range(3):
         page.mouse.move(200, 100)
@@ -391,7 +408,9 @@ def test_paints_have_a_legend_and_tell_the_value_under_the_pointer(opened):
         assert page.locator("#legend").is_visible()
         page.mouse.move(*place(page, 0.45, 0.5))
         page.wait_for_function("document.querySelector('#legend output').textContent.startsWith('here: ')")
-        assert float(page.inner_text("#legend output").removeprefix("here: ")) >= 0
+        value = page.inner_text("#legend output").removeprefix("here: ")
+        assert float(value) >= 0
+        assert len(value.replace(".", "").strip("0")) <= 2  # digits; 254 levels tell no more
     page.select_option("#paint", "")
     at_rest(page, paint="")
     assert not page.locator("#legend").is_visible()
@@ -504,6 +523,9 @@ def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
         page.keyboard.press(key)
     page.select_option("#paint", "cost")
     at_rest(page, paint="cost")
+    page.fill("#width", "100000")
+    page.click("#still")
+    page.wait_for_selector("#status[data-stage=problem]")  # it is long
     over = [page.locator(name) for name in ("#names", "#crops", "#legend", "#hint", "#status")]
     boxes = [box for each in over if (box := each.bounding_box())]
     for one, other in combinations(boxes, 2):
@@ -513,5 +535,6 @@ def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
         ]
         assert any(apart), (one, other)
     page.keyboard.press("h")
+    assert page.get_by_role("button", name="Controls", exact=True).get_attribute("aria-expanded") == "false"
     page.wait_for_function(f"document.querySelector('#stage').clientHeight === {size[1]}")
     assert decoded(page.screenshot()).std() > 1 / 255

@@ -101,6 +101,7 @@ class Subject:
             depth = median_depth(self.look.scene.means, self.views[0])
         except AaplugError:  # no Gaussian is in view
             depth = 1.0
+        training = {id(view) for view in self.cameras.train}
         return {
             "title": self.title,
             "words": command_line(self.words),
@@ -118,6 +119,7 @@ class Subject:
             "views": [
                 {
                     "name": view.name,
+                    "training": id(view) in training,
                     "width": view.width,
                     "height": view.height,
                     "focal": view.focal,

@@ -25,6 +25,8 @@ function controls() { // show the state
   at("asTrained").disabled = state.background === null;
   at("view").value = state.at === null ? "" : String(state.at);
   at("fade").value = state.fade;
+  const texts = {scale: scaleName(state.scale), fov: `${+state.fov.toPrecision(3)}°`, distance: `${+(state.depth / about.depth).toPrecision(3)}×`};
+  for (const [id, text] of Object.entries(texts)) { at(id).setAttribute("aria-valuetext", text); at(id).title = text; }
   at("fading").hidden = state.at === null || !view().photo;
   at("path").disabled = !path.length;
 }
@@ -41,7 +43,9 @@ function hello(facts) {
   at("lost").hidden = true;
   asked = "";
   if (same) return wake();
-  Object.assign(state, {scene: `${facts.title}, ${facts.gaussians}`, background: null, paint: null});
+  Object.assign(state, {scene: `${facts.title}, ${facts.gaussians}`, background: null, paint: null, record: false});
+  path.length = 0; // it was recorded in another scene
+  at("path").textContent = "Save path";
   document.title = `${facts.title} · aaplug`;
   at("title").textContent = facts.title;
   const kernels = facts.rasterizer === "compiled" ? "" : `, rasterizer ${facts.rasterizer}: \`aaplug warmup\` makes it faster`;
@@ -51,13 +55,22 @@ function hello(facts) {
     listed(`quality-${i}`, facts.qualities);
   }
   listed("paint", ["", ...Object.keys(facts.paints)], ["nothing", ...Object.values(facts.paints)]);
-  listed("view", ["", ...facts.views.keys()], ["–", ...facts.views.map(({name}) => name)]);
+  listCameras(facts);
   at("cameras").textContent = facts.assumed ? "Views" : "Cameras";
   toggles("scales", "radio", "size", EIGHTHS, scaleName);
   state.sides = facts.sides;
   home();
   if (first) fromAddress();
   else say(`opened ${facts.title}`);
+}
+
+function listCameras({views, assumed}) { // by kind: a test camera may have the name of a training camera
+  const groups = (assumed ? ["orbit", "assumed training"] : ["test", "training"]).map((label, i) => {
+    const group = Object.assign(document.createElement("optgroup"), {label});
+    group.append(...views.flatMap(({name, training}, index) => training === (i === 1) ? [new Option(name, index)] : []));
+    return group;
+  });
+  at("view").replaceChildren(new Option("–", ""), ...groups.filter((group) => group.children.length));
 }
 
 function home() { // where both sides differ most, or the first view as large as it fits

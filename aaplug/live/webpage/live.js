@@ -35,7 +35,7 @@ function extent() { // size and focal length of the picture that fits the state,
 function fitted(one) { // the field of view in degrees that shows all of a view, and the largest scale up to 1 that fits
   const ratio = stage.clientHeight / stage.clientWidth, half = Math.max(one.height, one.width * ratio) / 2 / one.focal;
   const scale = Math.min(1, stage.clientHeight * (window.devicePixelRatio || 1) / (2 * one.focal * half));
-  return {fov: clamp(Math.atan(half) * 360 / Math.PI, 5, 120), scale};
+  return {fov: Math.min(120, Math.atan(half) * 360 / Math.PI), scale};
 }
 
 // ---------------------------------------------------------------------------------------------------------- asking
@@ -119,6 +119,7 @@ const STAGES = {connecting: "connecting", moving: "moving", refining: "refining"
 function receive(header, bitmaps) {
   const problem = header.problem || header.refused;
   if (problem) {
+    at("status").dataset.stage = "problem";
     at("status").lastElementChild.textContent = problem;
     return say(problem);
   }
@@ -196,8 +197,9 @@ const nameOf = (i) => {
 };
 
 function labels() {
-  at("name-0").textContent = state.split > 0 ? nameOf(0) : "";
-  at("name-1").textContent = state.split < 1 ? nameOf(1) : "";
+  const faded = livePicture.photo && state.fade === 1; // the photograph hides both sides
+  at("name-0").textContent = faded ? "photograph" : state.split > 0 ? nameOf(0) : "";
+  at("name-1").textContent = !faded && state.split < 1 ? nameOf(1) : "";
   at("crops").hidden = !state.lens;
   const {start} = about;
   at("hint").hidden = !start || state.at !== start.view || state.scale !== start.scale || state.lens || livePicture.overlay;

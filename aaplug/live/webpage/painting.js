@@ -33,7 +33,7 @@ function paintSheet(bitmap, legend) { // a sheet of colours, and the levels bene
 function valueUnder({sheet, levels, legend}, x, y) { // under a place in shares, as text
   const column = Math.min(sheet.width - 1, Math.floor(x * sheet.width)), row = Math.min(sheet.height - 1, Math.floor(y * sheet.height));
   const level = levels[row * sheet.width + column];
-  return level ? shortNumber(valueAt(legend, (level - 1) / VALUE_LEVELS)) : "nothing";
+  return level ? String(+valueAt(legend, (level - 1) / VALUE_LEVELS).toPrecision(2)) : "nothing"; // levels tell no more digits
 }
 
 function drawLegend(place, legend) {
