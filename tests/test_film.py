@@ -129,12 +129,22 @@ def test_sizes_take_the_exposure_along():
         assert opened.intrinsics == closed.intrinsics == sized.intrinsics
 
 
-def test_the_shutter_opens_and_closes_halfway_to_the_neighbours():
+def test_the_shutter_is_open_around_each_frame_at_the_mean_speed_there():
     path = [make_camera((x, -4.0, 0.0)) for x in (0.0, 0.4, 1.2)]
     views = filmed(path, FilmOptions(shutter=0.5), True)
     places = [[camera.centre[0].item() for camera in view.exposure.motion] for view in views]
-    assert [x for pair in places for x in pair] == pytest.approx([-0.1, 0.1, 0.3, 0.6, 1.0, 1.4])
+    assert [x for pair in places for x in pair] == pytest.approx([-0.1, 0.1, 0.25, 0.55, 1.0, 1.4])
     assert filmed(path, FilmOptions(), True) == path
+
+
+def test_a_frame_on_a_curve_lies_in_the_middle_of_its_motion():
+    angles = (0.0, 0.3, 0.6)  # rad around the origin, with a zoom that turns back
+    zooms = zip((make_camera((4 * math.sin(a), 4 * math.cos(a), 0.0)) for a in angles), (1.0, 1.5, 1.0), strict=True)
+    path = [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera, zoom in zooms]
+    for view in filmed(path, FilmOptions(shutter=1.0), True):
+        middle = toward(*view.exposure.motion, 0.5)
+        torch.testing.assert_close(middle.cam_from_world, view.cam_from_world, rtol=0, atol=1e-3)
+        assert middle.intrinsics == pytest.approx(view.intrinsics)
 
 
 def test_an_f_stop_is_the_focal_length_over_the_diameter():

@@ -95,5 +95,14 @@ def _motions(frames: Sequence[Camera], shutter: float) -> list[tuple[Camera, Cam
     if len(frames) < 2:
         raise UsageError("shutter", "finds no motion: the path has one frame")
     ends = toward(frames[0], frames[1], -1.0), toward(frames[-1], frames[-2], -1.0)
-    around = zip([ends[0], *frames[:-1]], frames, [*frames[1:], ends[1]], strict=True)
-    return [(toward(frame, before, shutter / 2), toward(frame, after, shutter / 2)) for before, frame, after in around]
+    around = zip(frames, [ends[0], *frames[:-1]], [*frames[1:], ends[1]], strict=True)
+    half = shutter / 2
+    return [(_moved(*each, -half), _moved(*each, half)) for each in around]
+
+
+def _moved(frame: Camera, before: Camera, after: Camera, share: float) -> Camera:
+    """The frame's camera after a share of the time between frames, at the mean of the speeds before and after it.
+
+    Each of the speeds alone would cut the corner: on a curve, the frame would lie beside its own pose.
+    """
+    return toward(toward(frame, before, -share), toward(frame, after, share), 0.5)
