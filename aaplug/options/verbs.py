@@ -206,7 +206,7 @@ class MergeOptions(WritingOptions, FrameOptions):
     move: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
     """For each scene: how far it is moved, in world units, after the turn; 0,0,0 for none."""
     turn: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
-    """For each scene: degrees about x, then y, then z, or the four numbers w,x,y,z of a quaternion; 0,0,0 for none."""
+    """For each scene degrees about x, then y, then z (0,0,0: none); or for each a quaternion w,x,y,z (1,0,0,0)."""
     scale: Annotated[Sequence[float] | None, number(1e-6, 1e6, several=True, metavar="FACTOR ...")] = None
     """For each scene: how many times as large it becomes, about the origin of its file; 1 for none."""
 
