@@ -58,6 +58,15 @@ def test_without_photographs_cameras_should_look_at_the_scenes_middle():
     assert "the middle of the scene lies outside of the image" in found.doubt
 
 
+def test_a_photograph_of_one_colour_tells_nothing(few, sample_cameras, tmp_path: Path):
+    view = sample_cameras.train[0]
+    write_png(tmp_path / "flat.png", torch.full((*view.hw, 3), 0.3))
+    flat = replace(view, photo=tmp_path / "flat.png")
+    assert fit_of(few, CameraSet((flat,), (flat,))).gain is None
+    both = fit_of(few, CameraSet((view, flat), (flat,)))
+    assert both.gain == fit_of(few, CameraSet((view,), (view,))).gain
+
+
 @pytest.mark.parametrize("photographs", [True, False])
 def test_cameras_of_another_capture_are_refused_unless_min_seen_is_0(few, sample_cameras, photographs, caplog):
     scene, cameras = half_turn_about_x(few), sample_cameras

@@ -25,6 +25,7 @@ SAMPLE = 50_000  # Gaussians whose places are looked at
 VIEWS = 20  # cameras that look at them
 PHOTOGRAPHS = 3  # that are compared
 SIDE = 100  # px: longer side of the images that are compared
+FLAT = (0.5 / 255) ** 2  # variance of an image up to which it is one colour, rounded to 8 bits
 LARGEST = 3_000_000  # Gaussians: a larger scene is not rendered for this
 HALF_A_SIDE = 0.5  # distance from the image's centre beyond which the scene's middle is outside of it
 MIN_SHARE_LEAD = 0.1  # of Gaussians seen, by which a reading fits better
@@ -107,7 +108,7 @@ def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scen
 def _gain(look: Renderer, cameras: CameraSet) -> float | None:
     """PSNR of small renders over that of the photographs' mean colours, in dB, each on the background that fits.
 
-    It is the median over a few photographs; those that cannot be read do not count.
+    It is the median over a few photographs; those that cannot be read or have one colour alone do not count.
     """
     views = [view for view in cameras.all if view.photo is not None]
     if not views or not 0 < len(look.scene) <= LARGEST:
@@ -123,5 +124,6 @@ def _gain(look: Renderer, cameras: CameraSet) -> float | None:
         images = (rgb - behind[2] + behind).clamp(0, 1)
         error = (images - truth).square().mean(dim=(1, 2, 3)).min()
         flat = (truth - truth.mean(dim=(0, 1))).square().mean()
-        gains.append(float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10()))
+        if flat > FLAT:
+            gains.append(float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10()))
     return median(gains) if gains else None
