@@ -341,8 +341,7 @@ def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
     bent = one_camera(7, (300.0, 310.0, 200.0, 100.0, 0.9))
     cameras = read_cameras(colmap_bin(tmp_path / "sparse", *bent).parent)
     assert cameras.train[0].photo is None
-    assert "distorts (FOV)" in cameras.notes[-1]
-    assert "without photos" in cameras.notes[-1]
+    assert "distorts (FOV): drawn as pinholes, without photos" in cameras.notes[-1]
 
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])

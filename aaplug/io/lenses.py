@@ -97,13 +97,15 @@ def _notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], 
         return notes
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
     usable = sum(lens.lens is not None and (camera.photo is not None or not undistort) for lens, camera in pairs)
-    if undistort:
-        what = "renders are of the pinhole at its centre; photos are undistorted and cropped to what they cover"
-    else:
-        what = "renders are bent as their photos are; `undistort` straightens both"
-    if usable < len(pairs):
-        what += f"; {len(pairs) - usable} drawn as pinholes, without photos (colmap image_undistorter converts them)"
-    return [*notes, f"{counted(len(pairs), 'camera')} with a lens that distorts ({models}): {what}"]
+    what = list[str]()
+    if usable and undistort:
+        what.append("renders are of the pinhole at its centre; photos are undistorted and cropped to what they cover")
+    elif usable:
+        what.append("renders are bent as their photos are; `undistort` straightens both")
+    if left := len(pairs) - usable:
+        count = f"{left} " * (usable > 0)
+        what.append(f"{count}drawn as pinholes, without photos (colmap image_undistorter converts them)")
+    return [*notes, f"{counted(len(pairs), 'camera')} with a lens that distorts ({models}): {'; '.join(what)}"]
 
 
 @lru_cache(CACHED_LENSES)
