@@ -58,9 +58,18 @@ def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
     means = torch.cat([level.scene.means for level in levels])
     low, high = (torch.tensor(index["tree"]["bound"][end]) for end in ("min", "max"))
     torch.testing.assert_close(torch.stack([low, high]), torch.stack([means.amin(dim=0), means.amax(dim=0)]))
-    for resume, said in ((False, "already holds lod-meta"), (True, "out: is of a run that is complete")):
+
+
+@pytest.mark.parametrize("to", streamed.STREAMS)
+def test_a_complete_stream_is_refused_and_complete_only_for_as_many_levels(tmp_path, to):
+    made(tmp_path / "out", to)
+    for how, said in (
+        ({}, "already holds"),
+        ({"resume": True}, "out: is of a run that is complete"),
+        ({"resume": True, "levels": LEVELS + 1}, "already holds"),
+    ):
         with pytest.raises(OutputError, match=said):
-            made(tmp_path / "out", "sog", resume=resume)
+            made(tmp_path / "out", to, **how)
 
 
 def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves):

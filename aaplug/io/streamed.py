@@ -32,9 +32,9 @@ from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing, write_file
 from aaplug.io.rad import MAX_NODE_SIZE, rad_of, tree_of
 from aaplug.io.scenes import gltf, read_scene, write_scene
-from aaplug.io.scenes.pyramid_folder import Level
+from aaplug.io.scenes.pyramid_folder import MAX_GAUSSIANS, Level
 from aaplug.io.scenes.rows import library_errors
-from aaplug.io.values import Place, numbers, read_json
+from aaplug.io.values import Place, natural, numbers, object_of, read_json
 from aaplug.system.errors import FormatError, OutputError, UsageError, reason
 from aaplug.system.executors import Threads, given_threads
 
@@ -210,9 +210,17 @@ def write_index(
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
     view = {name: getattr(frame, name).tolist() for name in ("up", "front", "centre")} | {"radius": frame.radius}
-    write_file(folder / SETTINGS, _json({**settings, "view": view}), overwrite=True)
+    write_file(folder / SETTINGS, _json({**settings, "levels": levels, "view": view}), overwrite=True)
     write_file(folder / stream.index, content, overwrite=True)  # last: it is the mark
     return settings
+
+
+def level_count(folder: Path, name: StreamName) -> int:
+    """Levels of a complete stream; 0 of one that is cut short.  Raises FormatError if its settings are damaged."""
+    if not (folder / STREAMS[name].index).exists():
+        return 0
+    settings = object_of(read_json(folder / SETTINGS), folder / SETTINGS, "the settings", "'levels'", "levels")
+    return natural(settings.value("levels"), settings.place, "levels", MAX_GAUSSIANS)
 
 
 def _json(value: Mapping[str, Any]) -> bytes:

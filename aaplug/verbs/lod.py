@@ -312,14 +312,15 @@ def _source(maker: _Maker) -> str:
 
 
 def is_made(output: Path, options: LodOptions) -> bool:
-    """True if the output is complete: all files that the options ask for, or a stream of any number of levels."""
+    """True if the output is complete: the one scene, or at least as many levels as the options ask for."""
     if options.single:
         return output.is_file()
-    if options.to is not None:
-        return (output / STREAMS[options.to].index).exists()
     with suppress(FormatError):  # making them tells what is damaged
-        made = pyramid_folder.read_manifest(output, unfinished=True).levels
-        return len(made) > (options.levels or DEFAULT_LEVELS)
+        if options.to is not None:
+            made = streamed.level_count(output, options.to)
+        else:
+            made = len(pyramid_folder.read_manifest(output, unfinished=True).levels)
+        return made > (options.levels or DEFAULT_LEVELS)
     return False
 
 
