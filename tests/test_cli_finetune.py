@@ -76,7 +76,8 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
     monkeypatch.setattr(loop, "advance", pressed)
     code, out, err = cli(RUN)
     assert (code, out) == (130, "")
-    assert "stopped at step 1; the checkpoint is written; --resume continues" in err
+    assert "stopped at step 1\ntuned.finetune.pt is kept; --resume continues" in err
+    cli.refused(RUN, "tuned.finetune.pt: is of an interrupted run; --resume continues it, --overwrite starts anew")
     assert [path.name for path in Path().glob("tuned.*")] == ["tuned.finetune.pt"]
     Path("tuned.ply").touch()  # as if it had been killed while it measured
     monkeypatch.setattr(loop, "advance", real)
@@ -86,6 +87,12 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
     reports = [json.loads((p / "tuned.finetune.json").read_text()) for p in (Path(), whole)]
     assert reports[0]["curve"] == reports[1]["curve"]
+
+
+def test_ctrl_c_while_the_result_is_measured_says_that_the_run_can_be_resumed(cli, monkeypatch):
+    monkeypatch.setattr("aaplug.verbs.finetune.sampling_bounds", lambda *_: signal.raise_signal(signal.SIGINT))
+    code, _, err = cli(RUN)
+    assert (code, "tuned.finetune.pt is kept; --resume continues" in err) == (130, True)
 
 
 def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, monkeypatch, whole):

@@ -68,8 +68,7 @@ def tune(
         if done:
             tell(steps, steps)
     if not done:
-        outcome = "nothing is written" if checkpoint is None else "the checkpoint is written; --resume continues"
-        monitor.say(f"stopped at step {state.step}; {outcome}")
+        monitor.say(f"stopped at step {state.step}")
         raise KeyboardInterrupt
     return state
 

@@ -1,7 +1,8 @@
 """Fine-tuning: a plain scene file that looks right at every scale by the rule that will show it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
+from aaplug.system.monitor import Monitor
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import IS_COMPLETE, writes
 
@@ -84,7 +86,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     if isinstance(viewer, str):
         viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
-    resumes = options.resume and path is not None and _beside(path, "pt").exists()
+    checkpoint = path and _beside(path, "pt")
+    resumes = options.resume and checkpoint is not None and checkpoint.exists()
     replaces = options.overwrite or resumes  # beside a checkpoint, the other files are of the same run
     check = partial(_check, path, job.scene.files, options.resume, replaces)
     check()
@@ -102,7 +105,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
-    with running(options, path, check, job.inputs):
+    with running(options, path, check, job.inputs), _resumable(checkpoint, job.monitor):
         raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
         if options.poses:
             job = replace(job, cameras=refined(job, look, job.cameras.all)[0])
@@ -121,7 +124,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         cost = _cost(start, train, settings)
         job.announce([start], train, cost=cost, work=counted(settings.steps, "step"), fewer="steps")
         job.say_assumed(look)
-        checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)
         record = {"for": viewer.name, "method": settings.name}
         result = tuned_scene(state, tuning, viewer.convention_of(raw), record)
@@ -154,6 +156,17 @@ def _beside(scene: Path, kind: str) -> Path:
     return scene.with_suffix(f".finetune.{kind}")
 
 
+@contextmanager
+def _resumable(checkpoint: Path | None, monitor: Monitor) -> Iterator[None]:
+    """Say, where Ctrl-C ends the block, that its checkpoint continues."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if checkpoint is not None and checkpoint.exists():
+            monitor.say(f"{checkpoint} is kept; --resume continues")
+        raise
+
+
 def _check(path: Path | None, inputs: Sequence[Path], resume: bool, replaces: bool) -> None:
     """Check, before any work, that the scene and the files beside it may be written; a complete run is not resumed."""
     if path is None:
@@ -162,6 +175,8 @@ def _check(path: Path | None, inputs: Sequence[Path], resume: bool, replaces: bo
         return
     if resume and not replaces and path.exists() and _beside(path, "json").exists():
         raise OutputError(path, IS_COMPLETE)
+    if not replaces and (checkpoint := _beside(path, "pt")).exists():
+        raise OutputError(checkpoint, "is of an interrupted run; `resume` continues it, `overwrite` starts anew")
     check_scene_output(path, replaces, inputs)
     for kind in ("json", "png", "pt"):
         check_output(_beside(path, kind), replaces, inputs)
