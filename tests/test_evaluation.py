@@ -172,6 +172,8 @@ def test_figures_without_a_photograph_are_those_taken_by_hand(look, views):
     assert report.select("classic", 1.0)[0].values["consistency"] is None
     without = evaluate(task(look, views[:1], scales=(0.5,), metrics=FIGURES[:2]))  # the training size
     assert set(without.select("classic", 0.5)[0].values.values()) == {None}
+    assert "no consistency at 1/2: it needs scale 1 among the scales" in tables(without)
+    assert "no consistency at 1, 2×: it needs a scale below the training size" in tables(report)
 
 
 def test_flicker_of_supersampling_is_nearer_to_motion_alone(look, views):

@@ -118,6 +118,7 @@ class Metric:
     measure: the value for an image of 8 bits and the truth; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
     undefined: the reason why a value can be None; reports print it as a note.
+    smaller: defined below the training size alone.
     prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
@@ -129,6 +130,7 @@ class Metric:
     measure: Callable[[Image, Image], float | None] | None = None
     figure: Callable[[Series], float | None] | None = None
     undefined: str = "undefined for this image"
+    smaller: bool = False
     prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
 
     def __post_init__(self) -> None:
@@ -150,7 +152,8 @@ class Metric:
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""
-        return self._number(asked("metric", self, "figure", series)) if self.figure else None
+        none = self.figure is None or (self.smaller and series.scale >= 1)
+        return None if none else self._number(asked("metric", self, "figure", series))
 
     def _number(self, value: Any) -> float | None:
         try:

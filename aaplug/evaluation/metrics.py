@@ -94,7 +94,7 @@ def flicker(frames: Sequence[Image], motion: Sequence[Image]) -> float | None:
 
 
 def _consistency(series: Series) -> float | None:
-    if series.full is None or series.scale >= 1:
+    if series.full is None:
         return None
     return psnr(series.image.rgb.clamp(0, 1), series.smaller(series.full.rgb.clamp(0, 1)))
 
@@ -107,9 +107,7 @@ def _energy_drift(series: Series) -> float | None:
 
 
 def _flicker(series: Series) -> float | None:
-    if series.frames is None or series.scale >= 1:
-        return None
-    return flicker(*series.frames())
+    return None if series.frames is None else flicker(*series.frames())
 
 
 EQUAL = "equal images: PSNR is infinite and left out of the mean"
@@ -140,7 +138,8 @@ CONSISTENCY = Metric(
     protocol="PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that "
     "size, where the two are equal, and where scale 1 is not measured",
     figure=_consistency,
-    undefined="it needs a scale below the training size, and scale 1 among the scales",
+    undefined="it needs scale 1 among the scales",
+    smaller=True,
 )
 ENERGY = Metric(
     "energy drift",
@@ -161,7 +160,8 @@ FLICKER = Metric(
     "that of the training-size image, averaged down: "
     "1 is motion alone; null at and above the training size",
     figure=_flicker,
-    undefined="it needs a scale below the training size, and frames that differ",
+    undefined="it needs frames that differ",
+    smaller=True,
 )
 
 

@@ -58,6 +58,10 @@ class Report:
     protocol: Mapping[str, Any]
     measured: tuple[Metric, ...] = ()
 
+    def __repr__(self) -> str:
+        about = f"recipes={self.recipes}, scales={self.scales}, metrics={[metric.name for metric in self.metrics]}"
+        return f"Report({counted(len(self.measurements), 'measurement')}, {about})"
+
     @property
     def metrics(self) -> tuple[Metric, ...]:
         """The metrics measured, in order."""
@@ -215,7 +219,10 @@ def metric_grid(
     if not empty:
         return [*table]
     small = any(m.note == NO_PHOTOGRAPH for each in reports for m in each.measurements if m.scale in empty)
-    why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
+    too_large = metric.smaller and max(empty) >= 1
+    reasons = ["it needs a scale below the training size"] * too_large
+    reasons += [metric.undefined] * (not metric.smaller or min(empty) < 1)
+    why = NO_PHOTOGRAPH if small and metric.measure else "; ".join(reasons)
     if any(scale not in each.scales for each in reports for scale in empty):
         why = "some scenes have other scales"
     first, *others = (each.basis(metric.name) for each in reports)
