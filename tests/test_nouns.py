@@ -4,6 +4,7 @@ import copy
 import math
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,10 +16,12 @@ from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.scenes import read_scene, scene_of, write_scene
 from aaplug.methods import RECIPES
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
+from aaplug.verbs.render import Written
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 VIEWS = make_camera(), make_camera((3.0, -2.0, 1.0), name="other")
@@ -71,6 +74,11 @@ def test_what_is_printed_of_cameras_and_of_a_renderer_does_not_grow_with_them():
     assert len(repr(many)) == len(repr(few))
     assert "count=99" in repr(many)
     assert "name='classic'" in repr(many)
+    measured = Measurement("classic", 1.0, "a view", {"PSNR": 30.0}, 1, 0.1)
+    reports = [Report((measured,) * n, {}) for n in (10, 99)]
+    for short, long in ((few.scene, many.scene), (few.training, many.training), reports):
+        assert repr(short).replace("10", "99") == repr(long)
+    assert "\n" not in repr(Written(VIEWS[0], Path("a.png")))
 
 
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)

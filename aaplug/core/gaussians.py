@@ -91,6 +91,10 @@ class Gaussians:
             rows = f"a row of the file for each of {len(self):,} Gaussians, got {len(self.origin.rows):,}"
             raise UsageError("origin", f"expected {rows} (origin=None forgets the file)")
 
+    def __repr__(self) -> str:
+        facts = (f"{name}={getattr(self, name)}" for name in ("sh_degree", "flat", "fused", "convention"))
+        return f"Gaussians(count={len(self)}, name={self.name!r}, extras={[*self.extras]}, {', '.join(facts)})"
+
     def __len__(self) -> int:
         return self.means.shape[0]
 

@@ -38,6 +38,10 @@ class TrainingViews:
         if not self.cameras:
             raise UsageError("cameras", "there are none, and sampling bounds need at least one")
 
+    def __repr__(self) -> str:
+        known = f"{len(self.cameras)} cameras, {len(self.bounds.views)} Gaussians, cull_margin={self.cull_margin}"
+        return f"TrainingViews({known}, convention={self.convention})"
+
     @classmethod
     @contract
     def of(

@@ -25,6 +25,9 @@ class Written(NamedTuple):
     view: Camera
     file: Path
 
+    def __repr__(self) -> str:
+        return f"Written({self.view.name}, {self.view.width}x{self.view.height}, {self.file})"
+
 
 @writes(RenderOptions)
 def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options: RenderOptions) -> list[Written]:
