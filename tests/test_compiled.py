@@ -539,7 +539,8 @@ def test_kernels_that_do_not_compile_are_named_and_leave_no_other_unbuilt(empty_
     assert len(temporary) == 2
 
 
-def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(monkeypatch):
+@pytest.mark.parametrize("asked", [("auto", choice.STEPS_THAT_PAY), ("compiled", 1)])
+def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(monkeypatch, asked):
     kernels = CompiledKernels(lambda kernel: None)
 
     def fails(**_):
@@ -549,7 +550,7 @@ def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(monk
         monkeypatch.setattr(choice, name, value)
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
     said: list[str] = []
-    chosen = find_rasterizer("auto", choice.STEPS_THAT_PAY, said.append, gradients=True)
+    chosen = find_rasterizer(*asked, said.append, gradients=True)
     assert isinstance(chosen, Tiled)
     assert chosen.kernels is kernels
     assert "torch cannot compile slots here" in said[1]

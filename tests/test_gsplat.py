@@ -869,7 +869,7 @@ def test_what_is_wrong_or_not_supported_is_said(function, message, wrong):
 
 @pytest.mark.parametrize(("dtype", "later"), [(F64, ""), (torch.float32, ", and compiles it meanwhile")])
 def test_compiled_is_never_eager_without_a_word(monkeypatch, dtype, later):
-    monkeypatch.setattr("aaplug.gsplat.choice.find_rasterizer", lambda name, frames: Tiled(EAGER))
+    monkeypatch.setattr("aaplug.gsplat.choice.find_rasterizer", lambda name, frames, gradients: Tiled(EAGER))
     monkeypatch.setattr("aaplug.gsplat.drop_in.rasterizer_of", rasterizer_of.__wrapped__)
     call, problem = gaussians(dtype=dtype) | two_views(dtype), f"is compiled for {str(dtype)[6:]} "
     with pytest.raises(UsageError, match=rf"^rasterizer: no kernel 'composite-point' {problem}.*\beagerly{later}$"):

@@ -23,7 +23,7 @@ def rasterizer_of(name: str, precision: torch.dtype) -> Rasterizer:
     """A rasterizer by name for what a program draws; kernels are loaded and checked once, not for every image."""
     if (name, precision) == ("auto", torch.float64):
         log.warning("float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast")
-    found = find_rasterizer(name, None)
+    found = find_rasterizer(name, None, gradients=True)
     if name != "compiled":
         return found
     assert isinstance(found, Tiled)

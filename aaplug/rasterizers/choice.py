@@ -11,7 +11,7 @@ from aaplug.rasterizers.tiled.ahead_of_time import BUNDLE_VARIABLE, KERNELS, bui
 from aaplug.rasterizers.tiled.on_demand import OnDemandKernels
 from aaplug.system.errors import UsageError, not_one_of
 
-# Compiled, an 800 x 800 frame is 0.3 s faster and a step with gradients 1.5 s; compiling takes about two minutes.
+# Compiled, an 800 x 800 frame is 0.3 s faster and a step with gradients 1.5 s; compiling takes three minutes.
 FRAMES_THAT_PAY, STEPS_THAT_PAY = 400, 100
 
 
@@ -43,8 +43,8 @@ def find_rasterizer(
     kernels = load()
     pays = frames is not None and frames >= (STEPS_THAT_PAY if gradients else FRAMES_THAT_PAY) and has_compiler()
     lacks_gradients = gradients and not all(map(is_built, KERNELS))
-    if (name == "compiled" and kernels is None) or (pays and (kernels is None or lacks_gradients)):
-        say("rasterizer: compiling the kernels, once for this machine (one or two minutes on two cores)")
+    if (name == "compiled" or pays) and (kernels is None or lacks_gradients):
+        say("rasterizer: compiling the kernels, once for this machine (about three minutes on two free cores)")
         try:
             kernels = build(gradients=gradients)
         except UsageError as error:

@@ -23,7 +23,7 @@ class Kernels(NamedTuple):
 def warmup(
     recipe: str | Recipe | Sequence[str | Recipe] = (), bundle: AnyPath | None = None, *, monitor: Monitor = SILENT
 ) -> Kernels:
-    """Compile what is missing, in one to three minutes on two cores.
+    """Compile what is missing, in about three minutes on two free cores.
 
     Args:
         recipe: one or several whose kernels are compiled beside those that the default recipes need.
