@@ -98,7 +98,8 @@ def convert(words: Words) -> Answer:
     how = "part by part" if result.scene is None else f"fused {described_fusions(result.scene.fused)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     format = written_format(words.output)  # None for a folder of frames, which are .ply
-    say(result.viewer.advice("ply" if format is None else getattr(format, "read_as", None) or format.name))
+    kind = "ply" if format is None else getattr(format, "read_as", None) or format.name
+    say(result.viewer.advice(kind, words.output.name))
     title = "As the viewer draws it, against the scene's own training-size render:"
     shown = [] if result.report is None else [title, tables(result.report)[0]]
     return Answer({"output": str(words.output)} | result.as_json(), shown)
@@ -388,7 +389,7 @@ def view(words: Words) -> Answer:
     json_of("where the kernels are as one JSON object"),
 )
 def warmup(words: Words) -> Answer:
-    """Compile the fast rasterizer once for this machine (one to three minutes on two cores).
+    """Compile the fast rasterizer once for this machine (about three minutes on two free cores).
 
     The other verbs work without it, only slower.  To measure how fast it is, use bench.
     """

@@ -34,7 +34,7 @@ from aaplug.lab.gaussian_blending import GaussianBlending
 from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import PlugInError, UsageError
+from aaplug.system.errors import FormatError, PlugInError, UsageError
 from aaplug.system.registry import Registry
 from aaplug.verbs.check_plugin import check_plugin
 from aaplug.verbs.evaluate import evaluate
@@ -325,6 +325,11 @@ def test_a_camera_format_that_fails_after_another_read_the_folder_is_named(monke
     monkeypatch.setattr(Wrong, "sniff", fails)
     with pytest.raises(PlugInError, match=r"^camera format wrong: fails on .* with KeyError: 'key'"):
         read_cameras(SAMPLE)
+
+
+def test_a_camera_file_without_cameras_is_named(monkeypatch, tmp_path):
+    with pytest.raises(FormatError, match=r"views\.wrong: holds no training cameras"):
+        cameras_read(lambda *_: CameraSet((), ()), monkeypatch, tmp_path)
 
 
 def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):

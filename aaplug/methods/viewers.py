@@ -104,15 +104,15 @@ class Viewer:
             "known": self.evidence,
         }
 
-    def advice(self, suffix: str = "ply") -> str:
-        """One line on the settings to choose in the program for a file that was converted for it."""
+    def advice(self, suffix: str, file: str) -> str:
+        """One line on the settings to choose in the program for a file, of such a format, that was converted for it."""
         if suffix not in self.formats:
             others = [v for v in VIEWERS.values() if suffix in v.formats and v.convention == self.convention]
             alike = [v for v in others if suffix != "spz" or v.spz("auto") == self.spz("auto")]
             if alike:
-                return f"open the .{suffix} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
+                return f"open {file} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
             hint = f"; --for {others[0].name} writes one that {others[0].program} opens" if others else ""
-            return f"no viewer of this rule is known to open this .{suffix}{hint}"
+            return f"no viewer of this rule is known to open {file}{hint}"
         nothing, _, why = self.settings.partition(": ")
         if nothing in ("nothing", "none"):
             return f"in {self.program}, there is nothing to choose" + (f": {why}" if why else "")

@@ -104,6 +104,8 @@ def read_cameras(
     if found := recognized(path):
         with of_file(path):
             cameras = asked("camera format", found[0], "read", path, options)
+        if not cameras.train:
+            raise FormatError(path, "holds no training cameras")
         others = [each.sign for each in found if path.is_dir() and each.read != found[0].read]
         more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
         return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
