@@ -1,4 +1,4 @@
-"""What the user sees: log and progress on stderr, data on stdout."""
+"""The program's output: log and progress on stderr, data on stdout."""
 
 import logging
 import math

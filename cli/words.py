@@ -155,7 +155,7 @@ class Words:
 
 
 class Answer(NamedTuple):
-    """What a verb came to: facts for --json, tables and texts for people, and whether some of the work failed."""
+    """The result of a verb: facts for --json, tables and texts for people, and whether some of the work failed."""
 
     facts: Any
     shown: Sequence[Any] = ()

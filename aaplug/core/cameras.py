@@ -217,7 +217,7 @@ class Aperture:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a frame gathers light over: the opening of its lens, and the time that its shutter is open.
+    """The exposure of a frame: the opening of its lens, and the time that its shutter is open.
 
     aperture: None for a pinhole.
     motion: the cameras where the shutter opens and where it closes; None for an instant.

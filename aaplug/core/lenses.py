@@ -58,12 +58,12 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether places differ from the projection's own."""
+        """True if places differ from the projection's own."""
         return any((*self.radial, *self.rational, *self.tangential, *self.prism))
 
     @property
     def flat(self) -> bool:
-        """Whether splats are Gaussians in the pinhole's image plane, as training's were; else across their own ray."""
+        """True if splats are Gaussians in the pinhole's image plane, as training's were; else across their ray."""
         return self.projection in ("pinhole", "ortho")
 
     @property

@@ -128,7 +128,7 @@ class Splats2D:
 
 
 def ordering_depths(depths: Float[Tensor, " m"], ahead: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """What splats are sorted by on a ray, where they lie `ahead` deeper than at their centres, in world units.
+    """Keys that sort splats on a ray, where they lie `ahead` deeper than at their centres, in world units.
 
     Scenes are trained by the order of centres, so only a share of the change counts: more of it pops less and costs
     more dB.  Where a splat is nearer than its centre, twice as much pays.

@@ -314,7 +314,7 @@ class Conformance:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a renderer drew of a test."""
+    """A renderer's picture of a test."""
 
     test: Test
     picture: Picture

@@ -76,7 +76,7 @@ def _places(data_set: DataSet, root: Path, scene: str) -> Iterator[Path]:
 
 
 def is_set(protocol: str, folder: Path) -> bool:
-    """Whether a folder holds scenes of the protocol's data set."""
+    """True if a folder holds scenes of the protocol's data set."""
     known = DATA_SETS.get(protocol)
     return known is not None and any(each.is_dir() for s in known.scenes for each in _places(known, folder, s))
 

@@ -94,7 +94,7 @@ class Report:
         return list(dict.fromkeys(m.note for m in self.measurements if m.note))
 
     def basis(self, metric: str) -> dict[str, Any]:
-        """What decides on a metric's figures beside scene and recipe; those of another basis do not compare."""
+        """The choices behind a metric's figures, beside scene and recipe; figures of another basis do not compare."""
         parts = {"protocols": "protocol", "truths": "truth", "ways of downscaling": "downscale"}
         flavour = self.protocol.get("metrics", {}).get(metric)
         return {"flavours": flavour} | {words: self.protocol.get(key) for words, key in parts.items()}

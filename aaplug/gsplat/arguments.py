@@ -75,7 +75,7 @@ class AnyPose(Camera):
 
 @dataclass(frozen=True)
 class Options:
-    """What a call says beside its tensors; names and units as in `rasterization`.
+    """The arguments of a call beside its tensors; names and units as in `rasterization`.
 
     Raises:
         UsageError: a mode is not known.

@@ -1,4 +1,4 @@
-"""What gsplat's densification strategies compute on CUDA alone: relocation, and covariances for its noise.
+"""Densification steps that gsplat computes on CUDA alone: relocation, and covariances for its noise.
 
 n: Gaussians; b: leading dimensions.  3DGS-MCMC is Kheradmand et al. 2024, arXiv 2404.09591.
 """

@@ -77,7 +77,7 @@ def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels
 
 
 def drawer(rasterizer: Rasterizer, options: Options, pixel: PixelKernel) -> Callable[[Splats2D], Render]:
-    """What composites splats over black, by a pixel kernel."""
+    """The function that composites splats over black by a pixel kernel."""
     return lambda splats: rasterizer(splats, options.hw, BLACK, pixel, None, options.convention.rules)
 
 

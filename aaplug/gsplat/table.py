@@ -61,7 +61,7 @@ class Layout:
         return column.split(self.counts)
 
     def facts(self, options: Options) -> dict[str, Any]:
-        """What the table says beside its columns of numbers."""
+        """The facts of the table beside its columns of numbers."""
         cameras = self.shape[-1]
         ids = (self.images // cameras, self.images % cameras, self.sources) if self.packed else (None, None, None)
         return {

@@ -31,7 +31,7 @@ class ImageFormat:
 
     @property
     def lacks(self) -> bool:
-        """Whether the package that writes it is not installed."""
+        """True if the package that writes it is not installed."""
         return self.needs is not None and importlib.util.find_spec(self.needs) is None
 
 

@@ -115,7 +115,7 @@ def rad_of(tree: Tree) -> bytes:
 
 
 def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
-    """What Spark's 8 bits reach: of colours all of 0 to 1, of scales the largest, which the tree rests on."""
+    """The ranges of Spark's 8 bits: of colours all of 0 to 1, of scales up to the largest, which the tree rests on."""
     colours = scene.base_colours
     spans = {"rgbMin": min(0.0, _quantile(colours, 1 - SPANNED)), "rgbMax": max(1.0, _quantile(colours, SPANNED))}
     spans |= {"lnScaleMin": _quantile(scene.log_scales, 1 - SPANNED), "lnScaleMax": float(scene.log_scales.max())}

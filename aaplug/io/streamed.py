@@ -60,7 +60,7 @@ FACTS = 7  # numbers that tell of a part: its size and its box
 
 @dataclass(frozen=True)
 class Stream:
-    """What a viewer streams.
+    """The files of a stream, and the viewer that reads them.
 
     viewer: for whose rule levels are tuned.
     index: name of the index.
@@ -163,7 +163,7 @@ def read_front(folder: Path, number: int) -> Front:
 
 
 def facts_file(folder: Path, number: int) -> Path:
-    """What an index tells of a level's parts, kept until the index is written."""
+    """The file with an index's facts about a level's parts, kept until the index is written."""
     return folder / f"parts_{number}.json"
 
 
@@ -228,7 +228,7 @@ def _json(value: Mapping[str, Any]) -> bytes:
 
 
 def _read_parts(path: Path) -> list["_Part"]:
-    """What `write_level` wrote of a level's parts."""
+    """The facts that `write_level` wrote about a level's parts."""
     document, place = read_json(path), Place(path, "the file")
     place.expect(isinstance(document, list), "it", "a list of parts", document)
     facts = [numbers(fact, FACTS if fact else 0, place, "a part") for fact in document]
@@ -237,7 +237,7 @@ def _read_parts(path: Path) -> list["_Part"]:
 
 
 def programs_of(name: StreamName, modules: Path) -> list[Path]:
-    """What the page needs from a folder node_modules; raises UsageError if it is not there."""
+    """The programs of the page in a folder node_modules; raises UsageError if one is not there."""
     programs = STREAMS[name].programs
     for program in programs:
         if not (modules / program).exists():
@@ -265,7 +265,7 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
 
 
 class _Part(NamedTuple):
-    """What an index tells of a part.  size: its Gaussians.  box: empty where the part is."""
+    """An index's facts about a part.  size: its Gaussians.  box: empty where the part is."""
 
     size: int
     box: Box
@@ -330,7 +330,7 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
 
 
 def _spark_settings(front: Front) -> dict[str, Any]:
-    """What Spark must be set to, so that its budget does not lower the detail."""
+    """Settings of Spark by which its budget does not lower the detail."""
     leaves, rule = len(front.scene) - len(front.parents[front.parents >= 0].unique()), front.scene.convention
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.0, "blurAmount" if rule.compensated else "preBlurAmount": rule.kernel}
     budget = {"lodSplatCount": leaves, "lodRenderScale": MAX_NODE_SIZE}

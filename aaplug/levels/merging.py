@@ -36,7 +36,7 @@ GAUSSIANS_PER_BATCH = 1 << 17  # of whole chunks, merged at once: some 300 MB
 
 @dataclass(frozen=True)
 class Goal:
-    """What to merge for.
+    """The goal of merging.
 
     rate: sampling rate relative to training's at which the result is shown.
     count: how many Gaussians to leave; None for as many as `tolerance` asks.

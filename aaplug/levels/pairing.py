@@ -171,7 +171,7 @@ def _change(
     variance: Tensor,
     energies: Plane,
 ) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]]:
-    """What merging pairs changes in a plane, and the energy of each pair as if it lay in one place.
+    """Changes of a plane by merging pairs, and the energy of each pair as if it lay in one place.
 
     variance: of the pixel, which every covariance takes on.  energies: of the first, of the second, and between them.
     """

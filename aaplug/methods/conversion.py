@@ -95,7 +95,7 @@ def describe(fusion: Fusion) -> str:
 
 
 def described_fusions(fused: Sequence[Fusion]) -> str:
-    """What is fused in a scene, in words."""
+    """The filters fused into a scene, in words."""
     return "; ".join(map(describe, fused)) or "nothing"
 
 

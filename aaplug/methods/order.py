@@ -1,4 +1,4 @@
-"""What hangs on the order of splats along a ray: a compositor that finds the first, the middle and the heaviest one.
+"""The order of splats along a ray: a compositor that finds the first, the middle and the heaviest one.
 
 t: tiles; K: splats of a tile in turn; P: pixels per tile; p: pixels.
 w_i = alpha_i T_i: weight of the i-th splat of a pixel, in front of which the transmittance is T_i.

@@ -88,7 +88,7 @@ def _check_colour(text: str, where: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(Options):
-    """Whether scene and cameras belong together."""
+    """Check that scene and cameras belong together."""
 
     min_seen: Annotated[float, number(0, 1), CAMERAS] = MIN_SEEN_SHARE
     """Stop if the cameras see a smaller share of the Gaussians than this, or seem of another capture; 0 goes on."""
@@ -114,7 +114,7 @@ class ViewOptions(FrameOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeOptions(ViewOptions):
-    """What a recipe samples and compares with, and who draws it."""
+    """Samples of a recipe, the rate it compares with, and the workers that draw."""
 
     quality: Annotated[str, names(*QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
@@ -127,7 +127,7 @@ class RecipeOptions(ViewOptions):
 
     @property
     def choices(self) -> dict[str, str]:
-        """What decides on images, as results tell it."""
+        """The options that decide on images, as results tell them."""
         return {"quality": self.quality, "rate_reference": self.rate_reference or "pose", "order": self.order}
 
 
@@ -146,7 +146,7 @@ class ImageOptions(Options):
     format: Annotated[str | None, names(*IMAGE_FORMATS), FILES] = None
     """Format of image files (default: that of the output's name, or png)."""
     passes: Annotated[str | Sequence[str], names(*PASSES, metavar="rgb,depth,...", count=None), FILES] = ("rgb",)
-    """What image files hold: rgb, alpha, depth, depth-median, depth-nearest, normal, position, id, samples, bound."""
+    """Layers of image files: rgb, alpha, depth, depth-median, depth-nearest, normal, position, id, samples, bound."""
     normal_axes: Annotated[NormalAxes, FILES] = "camera"
     """Axes of normals: those of the world, or of the camera: right, up, towards the viewer."""
     transparent: Annotated[bool, FILES] = False

@@ -173,7 +173,7 @@ class CompareOptions(RecipeOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertOptions(WritingOptions, ViewOptions):
-    """What to fuse, and how to measure it."""
+    """The filter to fuse, and how to measure the result."""
 
     views: Annotated[str, VIEWS] = "train"
     """Views that --for is measured on, by name or split."""
@@ -265,7 +265,7 @@ class LodOptions(WritingOptions, ViewOptions):
 
     @property
     def single(self) -> bool:
-        """Whether one file is asked for, not a folder."""
+        """True if one file is asked for, not a folder."""
         return self.simplify is not None or self.budget is not None
 
     @property
@@ -300,7 +300,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
     """Factor on the method's learning rates."""
     truth: Source = "auto"
-    """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
+    """Images to match at the training size: self is the scene's own render; auto takes photographs if all exist."""
     poses: Annotated[bool, TUNING] = False
     """Refine the poses of all cameras on their photographs first, for cameras that are slightly off."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE"), TUNING] = None
@@ -342,7 +342,7 @@ class LiveOptions(ViewOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ConformOptions(Options):
-    """What to expect."""
+    """The expected pictures."""
 
     viewer: OneViewer = None
     """Whose rule to expect, such as classic, mip or spark: `aaplug guide viewers` (default: the one that fits best)."""
@@ -352,7 +352,7 @@ class ConformOptions(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(Options):
-    """What to time."""
+    """The scenes and sizes to time."""
 
     gaussians: Annotated[Sequence[int], number(1, 100_000_000, whole=True, several=True, metavar="N ...")] = (
         10_000,

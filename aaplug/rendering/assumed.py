@@ -1,4 +1,4 @@
-"""What stands in for cameras where there are none: views on an orbit, and an assumption about the training rate.
+"""Stand-ins for cameras where there are none: views on an orbit, and an assumed training rate.
 
 A scene's file does not say how finely training sampled it.  The assumption: by images of `TRAIN_VIEW` px taken from the
 default orbit.  A 3D filter that the file stores tells the rate itself; `cfg_args` beside the file may tell the width.
@@ -74,7 +74,7 @@ def frame_around(scene: Scene, orbit: Orbit, sample: Gaussians | None = None) ->
 
 
 def up_evidence(scene: Scene, orbit: Orbit, frame: Frame) -> str:
-    """What the direction that points up in the frame rests on, in words."""
+    """The evidence for the direction that points up in the frame, in words."""
     if orbit.up is not None:
         return "--up"
     if _by_nerfstudio(scene):

@@ -1,4 +1,4 @@
-"""What rendering will cost, estimated before it starts.
+"""The cost of rendering, estimated before it starts.
 
 Times are those of examples/guides/speed.md, on two cores; other machines differ by a factor of two or so.
 """

@@ -69,7 +69,7 @@ class LazyType:
 
 
 class Term(NamedTuple):
-    """What a hint allows: a test of values, and words for a message."""
+    """The values that a hint allows: a test of them, and words for a message."""
 
     holds: Callable[[Any, Sizes], bool]
     words: str

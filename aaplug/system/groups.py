@@ -1,4 +1,4 @@
-"""What Linux's control groups, versions 1 and 2, leave to this process, as containers limit it."""
+"""Limits of this process by Linux's control groups, versions 1 and 2, as containers set them."""
 
 import math
 import sys

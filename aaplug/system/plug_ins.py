@@ -48,7 +48,7 @@ def check_answer(where: str, answer: object, expected: type) -> None:
 
 
 def filtered(kind: str, filter: Callable[..., T], thing: T, *given: Any) -> T:
-    """What a filter makes of a thing, which keeps the shape and precision of its columns; errors as those of `asked`.
+    """A filter's result for a thing, of the same shapes and precision of columns; errors as those of `asked`.
 
     Raises:
         PlugInError: a plug-in's answer has other columns, or numbers that are NaN or infinite where they were not.
@@ -120,7 +120,7 @@ def _label(kind: str, plug_in: Any) -> str:
 
 @cache
 def _answer(kind: str, method: str) -> Term | None:
-    """What an interface's method returns; None if it does not say, or nothing or a truth value."""
+    """The type that an interface's method returns; None if it does not say, or nothing or a truth value."""
     function = vars(registry_of(kind).type).get(method)
     term = terms_of(function).get("return") if callable(function) else None
     return None if term is None or term.words in (WORDS[NoneType], WORDS[bool]) else term

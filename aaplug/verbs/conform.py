@@ -1,4 +1,4 @@
-"""What a renderer does wrong: ten tiny scenes, drawn by a program or by hand, against the pictures they should be."""
+"""Errors of a renderer: ten tiny scenes, drawn by a program or by hand, against the pictures they should be."""
 
 import os
 import shlex

@@ -134,7 +134,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
 def _request(
     job: Job[VideoOptions], renderer: Renderer, views: Sequence[Camera], storage: Storage, fps: float
 ) -> dict[str, Any]:
-    """What the frames of a sequence depend on; a run continues another if these are equal."""
+    """All that the frames of a sequence depend on; a run continues another if these are equal."""
     return {
         "frames": len(views),
         "fps": fps,

@@ -116,7 +116,7 @@ def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
 
 
 def names_image(output: Path) -> bool:
-    """Whether a name is that of one image, not of a folder."""
+    """True if a name is that of one image, not of a folder."""
     return output.suffix.lower() in IMAGES
 
 

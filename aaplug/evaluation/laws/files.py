@@ -57,7 +57,7 @@ def tells_scenes_apart(format: SceneFormat) -> None:
 
 @law_of("scene format")
 def reads_what_it_writes(format: SceneFormat) -> None:
-    """What it writes it takes, with as many Gaussians, at their places to 1 %, in any order."""
+    """It reads what it writes, with as many Gaussians, at their places to 1 %, in any order."""
     if not isinstance(format, WritableFormat):
         return
     scene = make_scene(COUNT)

@@ -55,7 +55,7 @@ class CameraFormat(Protocol):
     def sign(self) -> str: ...  # noqa: D102
 
     def sniff(self, path: Path) -> bool:
-        """Whether a file or folder is of this format.  Never raises."""
+        """True if a file or folder is of this format.  Never raises."""
         ...
 
     def read(self, path: Path, options: CameraFileOptions) -> CameraSet:

@@ -63,7 +63,7 @@ Channel = tuple[Tensor, Tensor, str]  # times in s, values, interpolation
 
 
 def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
-    """What the animations move, by node and path; the first wins."""
+    """The animated channels, by node and path; the first animation wins."""
     found: dict[int, dict[str, Channel]] = {}
     nodes = len(file.items("nodes"))
     for animation in file.items("animations"):

@@ -57,7 +57,7 @@ class PhotoFolder:
         return photo
 
     def notes(self, cameras: Sequence[Camera]) -> list[str]:
-        """What to tell where no camera has its photo although there are folders of photos, or where there are masks."""
+        """Notes where no camera has its photo although there are folders of photos, or where there are masks."""
         beside = _listed(self.folder.parent)
         others = [path.name for path in beside if PHOTO_FOLDERS[1].fullmatch(path.name) and path != self.folder]
         notes = [MASKED] if any(path.name == MASKS for path in beside) else []

@@ -94,7 +94,7 @@ def at_photo_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tupl
 
 
 def _uncapped(sizes: Sequence[Size]) -> str:
-    """What to add to the reason for sizes that trainers make smaller."""
+    """An addition to the reason, for sizes that trainers make smaller."""
     caps = f"; 3DGS caps the width at {WIDTH_CAP} px and nerfstudio halves larger ones: `train_scale` sets it"
     return caps if max(map(max, sizes), default=0) > WIDTH_CAP else ""
 

@@ -95,7 +95,7 @@ def _check_layers(path: Path) -> None:
 
 
 def _moves(camera: Any) -> bool:
-    """Whether the camera, or a prim above it, has time samples."""
+    """True if the camera, or a prim above it, has time samples."""
     UsdGeom, prim = module("UsdGeom"), camera.GetPrim()
     names = UsdGeom.Camera.GetSchemaAttributeNames(False)
     own = any(prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)

@@ -47,7 +47,7 @@ class SceneFormat(Protocol):
     def name(self) -> str: ...  # noqa: D102
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        """Whether a file that begins with `head` is of this format.  Never raises."""
+        """True if a file that begins with `head` is of this format.  Never raises."""
         ...
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:

@@ -16,7 +16,7 @@ HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
 
 
 def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
-    """What no renderer can use, and in which rows: NaN, infinities, quaternions without a direction, negative filters.
+    """Unusable values and their rows: NaN, infinities, quaternions without a direction, negative filters.
 
     A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
     """
@@ -57,7 +57,7 @@ def check_values(scene: Gaussians) -> None:
 
 
 def doubts_of(scene: Gaussians) -> dict[str, int]:
-    """What renderers can use but hardly was meant, and in how many rows."""
+    """Values that renderers can use but that were hardly meant, and their number of rows."""
     if not len(scene):
         return {}
     doubts = dict[str, int]()

@@ -1,4 +1,4 @@
-"""What formats beside .ply share: values as they store them, bounded decompression, axes, and files of several files.
+"""Parts of formats other than .ply: values as they store them, bounded decompression, axes, and files of several files.
 
 n: rows.  Arrays are numpy's, as they come from files.
 
@@ -56,7 +56,7 @@ def word_quats(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "n 
 
 
 def without_largest(quats: Float[Tensor, "n 4"]) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
-    """What `largest_last` takes: the three smaller components, where the largest is positive, and its index."""
+    """The inverse of `largest_last`: the three smaller components, where the largest is positive, and its index."""
     largest = quats.abs().argmax(dim=1)
     others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     negative = quats.gather(1, largest[:, None]) < 0

@@ -92,7 +92,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 
 
 def beside(scene: Gaussians) -> str:
-    """What the scene has beside its parameters and only a .ply keeps, in words; "" for nothing.
+    """The columns beside its parameters that only a .ply keeps, in words; "" for none.
 
     Left out are normals, which nothing uses, colours in bytes, which say no more than f_dc, and comments, but for the
     one that says which way is up.

@@ -45,7 +45,7 @@ class LevelFile:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What lod.json says; see the module."""
+    """The contents of lod.json; see the module."""
 
     source: str
     largest: int

@@ -1,4 +1,4 @@
-"""What a format cannot say about a scene: kept in a record of ours where other programs leave one alone, or told.
+"""Facts about a scene that a format has no place for: in a record of ours where other programs keep it, or told.
 
 The one rule of all formats: what would change the picture is refused, what was only said about it is kept, in the
 format's own tag or in the record, and a warning names what reading the file again will not give.
@@ -27,7 +27,7 @@ log = logging.getLogger("aaplug")
 
 
 class Facts(NamedTuple):
-    """What a file says about its scene; evidence: where, for the user.  flat: see `Gaussians`."""
+    """A file's facts about its scene; evidence: where, for the user.  flat: see `Gaussians`."""
 
     evidence: str
     convention: Convention = CLASSIC

@@ -1,4 +1,4 @@
-"""What every scene format needs: its options, errors of libraries as ours, rows of a table, the limit of a scene."""
+"""Parts of every scene format: its options, errors of libraries as ours, rows of a table, the limit of a scene."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -105,7 +105,7 @@ FORMATS = tuple(UsdFormat(suffix) for suffix in SUFFIXES)
 
 
 def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    """What the child says of a file, and the arrays that it leaves."""
+    """The child's answer about a file, and the arrays that it leaves."""
     command = [sys.executable, str(CHILD), str(path.resolve()), str(file)]
     seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
     try:
