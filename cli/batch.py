@@ -24,7 +24,7 @@ ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the who
 BATCH = Option(
     "batch",
     flag("FILE.toml", read=Path),
-    "Scenes and their settings from a file, and a folder for all as --output; what it does not say is as given here.",
+    "File of scenes and their settings, for an --output folder; options given here hold where it says nothing.",
 )
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
     BATCH,

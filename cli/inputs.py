@@ -41,7 +41,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, flag("[SCENE]", read=Path, by_place=True)] = None
-    """A scene (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels, for some frames."""
+    """A scene file (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels or frames."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None
@@ -61,7 +61,7 @@ class CameraOptions(Options):
     test_every: Annotated[int | None, number(0, 1_000_000, whole=True, metavar="N"), CAMERAS] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
     undistort: Annotated[bool, CAMERAS] = False
-    """Straighten photographs whose lens distorts, and draw pinhole views instead of bent ones."""
+    """Undistort photographs, and draw pinhole views."""
 
 
 SCENE_AND_CAMERAS: Sequence[type[Options]] = (SceneOptions, CameraOptions, Orbit)

@@ -80,10 +80,10 @@ def render(words: Words) -> Answer:
     json_of("what was done as one JSON object"),
 )
 def convert(words: Words) -> Answer:
-    """Fuse anti-aliasing into a plain scene file of as many Gaussians, for viewers with a fixed 2D filter.
+    """Fuse anti-aliasing into a plain scene file, for viewers with a fixed 2D filter.
 
-    It takes seconds for the 2D Mip filter (0.1 px², compensated), and minutes for a viewer named by --for.  For fewer
-    Gaussians, use lod; to move the Gaussians until all sizes look right, finetune.
+    It takes seconds for the 2D Mip filter (0.1 px², compensated), and minutes for a viewer named by --for.  The number
+    of Gaussians stays.  For fewer, use lod; to move the Gaussians until all sizes look right, finetune.
     """
     if words.batch is not None:
         return for_each_scene(words, lambda scene: ".ply", lambda scene: scene.output.is_file())
@@ -176,7 +176,7 @@ def finetune(words: Words) -> Answer:
     json_of("results.json instead of the table"),
 )
 def evaluate(words: Words) -> Answer:
-    """Measure recipes over scales, against photographs or against the scene's own look; of one scene or many.
+    """Measure recipes at several scales, against photographs or the scene's own look; one scene or many.
 
     A folder of all scenes of NeRF-synthetic (--protocol blender) or Mip-NeRF 360 (360-zoom-out, 360-zoom-in) gives the
     papers' table.  To measure scene files against each other, use compare; for images only, render.
@@ -219,10 +219,10 @@ def video(words: Words) -> Answer:
     Option(
         "scenes",
         flag("SCENE SCENE [SCENE ...]", read=Path, by_place=True, count=None),
-        "Two or more scenes of any format, or their folders; the first is what the others are held to.",
+        "Two or more scenes of any format, or their folders; the others are compared with the first.",
         (),
     ),
-    Option("reference", flag("SCENE", read=Path), "The scene that the others are held to, instead of the first."),
+    Option("reference", flag("SCENE", read=Path), "The scene to compare the others with, instead of the first."),
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
@@ -237,7 +237,7 @@ def video(words: Words) -> Answer:
     json_of("compare.json instead of the tables"),
 )
 def compare(words: Words) -> Answer:
-    """Measure what compression, conversion, pruning or training again cost: scenes against the first, at every size.
+    """Measure how far compressed, converted, pruned or retrained scenes are from the first, at every size.
 
     To measure recipes on one scene, use evaluate.
     """
@@ -269,10 +269,10 @@ def compare(words: Words) -> Answer:
     json_of("what was done as one JSON object"),
 )
 def merge(words: Words) -> Answer:
-    """Put scenes into one file, each moved, turned and scaled, all by one rule of drawing.
+    """Put scenes into one file, each moved, turned and scaled, in one convention.
 
-    Scenes of several rules are converted, for which --cameras, or each model folder's own, tell how finely training
-    sampled them.  To make one scene lighter, use lod.
+    Scenes of several conventions are converted; --cameras, or those of each model folder, tell training's sampling
+    rates.  To make one scene lighter, use lod.
     """
     scenes = [open_scene(words, path) for path in words.scenes]
     cameras = read_cameras(words, scenes[0]) if words.cameras else None
@@ -288,9 +288,9 @@ def merge(words: Words) -> Answer:
     json_of("one JSON object instead of a table"),
 )
 def info(words: Words) -> Answer:
-    """Tell about a scene: its convention and why, what is fused, what is odd.
+    """Describe a scene: its convention and the evidence for it, fused filters, and odd values.
 
-    With cameras it tells how finely they sample the scene.  To see the scene, use view; to measure images of it,
+    With cameras, also their sampling rates.  To see the scene, use view; to measure images of it,
     evaluate.
     """
     if words.limits:
@@ -354,7 +354,7 @@ def demo(words: Words) -> Answer:
 
 @verb(*SCENE_AND_CAMERAS, verbs.LiveOptions)
 def view(words: Words) -> Answer:
-    """Look at a scene live in the browser, classic 3DGS beside aaplug; without SCENE at the bundled sample.
+    """Show a scene live in the browser, classic 3DGS beside aaplug; without SCENE, the bundled sample.
 
     To write images, use render; for a moving camera, video.
     """
@@ -377,7 +377,7 @@ def view(words: Words) -> Answer:
     Option(
         "recipe",
         names(kind="recipe", metavar=RECIPE_METAVAR, count=None),
-        "Compile what these recipes need, too; by default what auto, matched, classic and mip need.",
+        "Recipes whose kernels to compile, beside those of auto, matched, classic and mip.",
         (),
     ),
     Option(
@@ -403,9 +403,9 @@ def warmup(words: Words) -> Answer:
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> Answer:
-    """Check what a package adds: filters, kernels, rasterizers, recipes, metrics and formats by their laws.
+    """Test the filters, kernels, rasterizers, recipes, metrics and formats of a package by their laws.
 
-    While writing a plug-in.  To measure how good the recipes that it adds are, use evaluate.
+    For authors of plug-ins.  To measure the recipes that it adds, use evaluate.
     """
     verdicts = aaplug.check_plugin(words.module, monitor=TERMINAL)
     outcomes = [f"FAILED: {each.problem}" if each.problem else "passed" for each in verdicts]
@@ -421,16 +421,14 @@ def check_plugin(words: Words) -> Answer:
         " the .png to write; without them, the three are added at the end.",
     ),
     Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png."),
-    output(
-        "FOLDER", "Folder for scenes, cameras and pictures; without PROGRAM and --images they are written alone.", None
-    ),
+    output("FOLDER", "Folder for scenes, cameras and pictures; alone, it gets the expected pictures.", None),
     verbs.ConformOptions,
     json_of("the verdicts as one JSON object"),
 )
 def conform(words: Words) -> Answer:
-    """Judge a renderer by its pictures of ten tiny scenes, and name what it does wrong.
+    """Test a renderer by its pictures of ten tiny scenes, and name what it draws wrong.
 
-    Exits with 1 if anything is.  To fit a scene to a viewer's rule instead, use convert --for.
+    Exits with 1 if anything is wrong.  To fit a scene to a viewer's rule instead, use convert --for.
     """
     verdict = aaplug.conform(words.program, words.images, words.output, **told(words, verbs.ConformOptions))
     if verdict is None:
@@ -447,9 +445,9 @@ def conform(words: Words) -> Answer:
     return Answer(facts | {"tests": tests}, [table(rows, headings)], not verdict.right)
 
 
-@verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))
+@verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('the figures, or {"runs": [...]} of several, as one JSON object'))
 def bench(words: Words) -> Answer:
-    """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view).
+    """Time the rasterizer on synthetic scenes, or on the first training view of SCENE.
 
     To measure how close images come to the truth, use evaluate; to compile the fast rasterizer, warmup.
     """
@@ -484,7 +482,7 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
 
 @verb(json_of("the table as a list of objects"))
 def viewers(words: Words) -> Answer:
-    """List the viewers that --for knows: what each adds to a splat, where a splat ends, and what to set there.
+    """List the viewers that --for knows: the 2D filter of each, where its splats end, and the settings to choose.
 
     To fit a scene to one of them, use convert; to draw scenes as it does, compare.
     """
@@ -498,10 +496,10 @@ def viewers(words: Words) -> Answer:
 
 @verb(json_of("the table as a list of objects"))
 def recipes(words: Words) -> Answer:
-    """List the recipes that --recipe knows: what each is and whose, its cost, and when to use it.
+    """List the recipes that --recipe knows: the method and source of each, its cost, and when to use it.
 
-    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ.  Where no time is given it is about
-    classic's, or not known.  To measure recipes on a scene, use evaluate.
+    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ.  Where no time is given, it
+    is about that of classic, or not known.  To measure recipes on a scene, use evaluate.
     """
     from aaplug.methods import RECIPES
     from aaplug.system.registry import names_of

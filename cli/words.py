@@ -235,7 +235,7 @@ class Command:
                 raise
             text = box.getvalue().partition("\n")[2]  # without the title; the box is drawn in ASCII on some terminals
             text = re.sub(r"(?m)^(\W {5}-.*?\S) *\W?$", r"\1:", text)  # an option, before its help
-            text = " ".join(re.findall(r"[^\s│╭╮╰╯─|+]+", text))
+            text = " ".join(re.findall(r"[^\s│╭╮╰╯─|+]+", re.sub("-{3,}", "", text)))
             text = re.split(r" \(required\)| For full helptext| Argument helptext", text)[0]
             raise self.refusal(text.replace(f" from aaplug {self.name}", "").rstrip(". ")) from end
         if rest:

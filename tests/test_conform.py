@@ -202,7 +202,7 @@ def test_pictures_by_hand(cli, tmp_path):
 def test_what_contradicts_itself_is_refused(tmp_path):
     for words, problem in [
         ({}, "name a program"),
-        ({"program": "x", "images": tmp_path}, "both give the pictures"),
+        ({"program": "x", "images": tmp_path}, "gives the pictures, as `program` does"),
         ({"program": "nowhere/at-all"}, "cannot be started: nowhere/at-all: no such file"),
         (
             {"program": "sh -c 'echo no such scene >&2; exit 3'"},

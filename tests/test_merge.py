@@ -118,7 +118,7 @@ def test_discs_and_ellipsoids_do_not_mix():
         aaplug.merge([oracle(), flat])
     with pytest.raises(UsageError, match="2D Gaussians"):
         aaplug.merge([flat], into="classic")
-    with pytest.raises(UsageError, match="there are none"):
+    with pytest.raises(UsageError, match="needs at least one, got none"):
         aaplug.merge([])
 
 

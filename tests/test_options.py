@@ -1,8 +1,10 @@
 """Options: every number has a range that --help shows and the library checks; the program answers in one line."""
 
 import dataclasses
+import io
 import math
 import re
+import sys
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -85,7 +87,7 @@ REFUSED = {
     "render s.ply -o out --scale x": "--scale: takes 0.001..64, got x",
     "render s.ply -o out --passes rgb,depth,rgb": "--passes: names one twice: rgb, depth, rgb",
     "render s.ply -o out --bit-depth 9": "--bit-depth: '9' is not one of 8, 16, 32",
-    "render s.ply -o out --scale 2 --resolution 8x8": "--scale: and --resolution both set the size; give one",
+    "render s.ply -o out --scale 2 --resolution 8x8": "--scale: sets the size, as --resolution does; give one",
     "render s.ply -o out --resolution -1x-1": "--resolution: takes sizes such as 400x400, got -1x-1",
     "render s.ply -o out --resolution 99999x-1": "--resolution: would be 99999x99999 px; the limit is 16384 a side",
     "render s.ply -o out --path p.json --views train": "--views: are replaced by --path; give one of the two",
@@ -105,6 +107,7 @@ REFUSED = {
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
     "evaluate s.ply -o out --show 5": "--show: selects views of the report; give --report, too",
     "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
+    "check-plugin json": "module json: holds no object that has laws",
     "bench --gaussians 1e5": "takes N ..., each a whole number 1..100000000, got 1e5",
     "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",
     "rendr s.ply": "there is no verb 'rendr'; did you mean render?",
@@ -121,6 +124,12 @@ def test_no_option_takes_an_empty_word():
             if option.argument is not None:
                 with pytest.raises(UsageError, match=r"takes .*, got nothing"):
                     option.value([""] * (option.argument.count or 1))
+
+
+def test_a_refusal_has_no_frame_on_a_terminal_without_unicode(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
+    with pytest.raises(UsageError, match=r"aaplug render: Missing: -o PATH"):
+        VERBS["render"].parse(["s.ply"])
 
 
 @pytest.mark.parametrize("words", REFUSED)

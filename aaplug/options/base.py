@@ -29,12 +29,12 @@ class Group:
 
 CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
 ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
-LENS = Group("lens", "What projects the scene, beside the lens that the camera files state.")
-FILES = Group("file", "What image files hold, and how.")
+LENS = Group("lens", "The lens to draw through, instead of that of the camera files.")
+FILES = Group("file", "Contents and format of image files.")
 DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
-FILM = Group("film", "Aperture and shutter: what lies out of focus, or moves while the shutter is open, is blurred.")
+FILM = Group("film", "Aperture and shutter, for defocus and motion blur.")
 REPORT = Group("report", "Files beside the figures.")
-TUNING = Group("tuning", "The optimization, of which the defaults were measured.")
+TUNING = Group("tuning", "The optimization; its defaults were chosen by measurement.")
 
 
 @dataclass(frozen=True, kw_only=True)

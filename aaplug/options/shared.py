@@ -91,7 +91,7 @@ class FrameOptions(Options):
     """Check that scene and cameras belong together."""
 
     min_seen: Annotated[float, number(0, 1), CAMERAS] = MIN_SEEN_SHARE
-    """Stop if the cameras see a smaller share of the Gaussians than this, or seem of another capture; 0 goes on."""
+    """Stop if the cameras see less than this share of the Gaussians, or seem of another capture; 0 never stops."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,15 +101,15 @@ class ViewOptions(FrameOptions):
     views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
     background: Annotated[Background, Text(metavar="auto|COLOUR", parsed=_check_colour)] = "auto"
-    """Colour behind the scene as CSS writes it, such as white or "#ff8000"; auto is what training had."""
+    """Colour behind the scene in CSS, such as white or "#ff8000"; auto is that of training."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
     rasterizer: Annotated[str | Rasterizer, names("auto", "compiled", kind="rasterizer"), DRAWING] = "auto"
     """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
     memory: Annotated[float | None, number(0.01, 1024, metavar="GB"), DRAWING] = None
-    """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
+    """Memory for drawing a frame, beside scene and image (default: 1)."""
     cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), CAMERAS] = math.inf
-    """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
+    """Leave out Gaussians centred outside the image by more than this share of its longer side, if training did."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,9 +121,9 @@ class RecipeOptions(ViewOptions):
     rate_reference: Annotated[str | None, names(*get_args(RateReference)), DRAWING] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
     order: Annotated[SplatOrder, DRAWING] = "depth"
-    """Order of splats: depth, of their centres, or tile, their depth along the ray of each tile: colours pop less."""
+    """Order of splats: by depth of their centres, or per tile, by depth along its ray, so that colours pop less."""
     scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT"), DRAWING] = None
-    """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""
+    """Draw views on a Dask cluster: --threads processes of this machine, or the cluster at an address."""
 
     @property
     def choices(self) -> dict[str, str]:
@@ -159,7 +159,7 @@ class ImageOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.scale is not None and self.resolution is not None:
-            raise UsageError("scale", "and `resolution` both set the size; give one")
+            raise UsageError("scale", "sets the size, as `resolution` does; give one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ class FilmOptions(RecipeOptions):
     blades: Annotated[int | None, number(3, 64, whole=True), FILM] = None
     """Corners of the aperture (default: a disc)."""
     shutter: Annotated[float | None, number(0.001, 1), FILM] = None
-    """Time that the shutter is open, of that from frame to frame of a path; film's usual is 0.5."""
+    """Time that the shutter is open, as a share of the time between frames; 0.5 is usual in film."""
     samples: Annotated[int | None, number(0, 4096, whole=True, metavar="N"), FILM] = None
     """Frames averaged to one (default: 16, or 5 with --quality fast); 0 ignores a path file's aperture and shutter."""
 
@@ -186,7 +186,7 @@ class FilmOptions(RecipeOptions):
         if self.focus_at is not None and len(self.focus_at) != 3:
             raise UsageError("focus_at", f"takes three numbers X Y Z, got {len(self.focus_at)}")
         if self.focus_distance is not None and self.focus_at is not None:
-            raise UsageError("focus_distance", "and `focus_at` both set the focus; give one")
+            raise UsageError("focus_distance", "sets the focus, as `focus_at` does; give one")
         if self.f_stop is not None and self.focus_distance is None and self.focus_at is None:
             raise UsageError("f_stop", "is an aperture without focus; give `focus_distance` or `focus_at`")
         for name in ("sensor", "focus_distance", "focus_at", "blades"):
@@ -233,9 +233,9 @@ class Orbit(Options):
     up: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Direction that points up, X Y Z (default: 0 -1 0, or what file and colours say)."""
     train_view: Annotated[str | None, Text(metavar="WxH", parsed=size_of), ORBIT] = None
-    """Size in px of the training images, which are taken to show what the orbit shows (default: 1600x1066)."""
+    """Assumed size in px of the training images, which show what the orbit shows (default: 1600x1066)."""
     train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), ORBIT] = None
-    """Instead, px per world unit in the middle of the scene in training."""
+    """Instead, training's px per world unit in the middle of the scene."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -244,7 +244,7 @@ class Orbit(Options):
             if value is not None and len(value) != 3:
                 raise UsageError(name, f"takes three numbers X Y Z, got {len(value)}")
         if self.train_view is not None and self.train_rate is not None:
-            raise UsageError("train_view", "and `train_rate` both set the training rate; give one")
+            raise UsageError("train_view", "sets the training rate, as `train_rate` does; give one")
         for name in ("orbit", "elevation"):
             if self.eye is not None and getattr(self, name) is not None:
                 raise UsageError("eye", f"is a single place, which `{name}` would change; give one")

@@ -122,7 +122,7 @@ class EvaluateOptions(RecipeOptions):
     truth: Source = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
     poses: Annotated[bool, REPORT] = False
-    """Refine the poses of the views on their photographs first: errors that then vanish were the cameras'."""
+    """Refine the poses of the views on their photographs first: errors that vanish were errors of the cameras."""
     metric: Annotated[str | Sequence[str] | None, METRICS] = None
     """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
     lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2), REPORT] = None
@@ -202,13 +202,13 @@ class MergeOptions(WritingOptions, FrameOptions):
     """Where each scene goes, and by which rule the file is to be drawn."""
 
     into: Annotated[str | None, names(*CONVENTIONS)] = None
-    """Rule that all scenes are converted to (default: theirs if they agree, else mip)."""
+    """Convention to convert all scenes to (default: theirs if they agree, else mip)."""
     move: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
-    """For each scene: how far it is moved, in world units, after the turn; 0,0,0 for none."""
+    """For each scene: move in world units, after the turn; 0,0,0 for none."""
     turn: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
-    """For each scene degrees about x, then y, then z (0,0,0: none); or for each a quaternion w,x,y,z (1,0,0,0)."""
+    """For each scene: degrees about x, then y, then z (0,0,0: none); or for each a quaternion w,x,y,z."""
     scale: Annotated[Sequence[float] | None, number(1e-6, 1e6, several=True, metavar="FACTOR ...")] = None
-    """For each scene: how many times as large it becomes, about the origin of its file; 1 for none."""
+    """For each scene: factor on its size, about the origin of its file; 1 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,16 +216,16 @@ class LodOptions(WritingOptions, ViewOptions):
     """How light, and how to tune."""
 
     views: Annotated[str, VIEWS] = "train"
-    """Views that levels are tuned on and that tell what is hidden, with free ones between them."""
+    """Views to tune levels on and to find hidden Gaussians by, with free ones between them."""
 
     simplify: Annotated[float | None, number(1e-6, 1e9, metavar="SHARE|COUNT")] = None
-    """Write one scene with this share of the Gaussians; above 1, with so many."""
+    """Write one scene with this share of the Gaussians or, above 1, this number of them."""
     budget: Annotated[float | None, number(0.001, 1e6, metavar="MB")] = None
-    """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
+    """Write one scene with as many Gaussians as fit into a .ply of this size (in 10^6 bytes)."""
     levels: Annotated[int | None, number(1, 12, whole=True)] = None
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
     merge_below: Annotated[float, number(0, 10)] = 0.0
-    """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
+    """With levels: merge all Gaussians up to this many px of the level; faster to draw, and less exact."""
     scale: Annotated[float | None, number(0.001, 1)] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
@@ -280,15 +280,15 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """The optimization."""
 
     viewer: Annotated[str | Viewer | None, names("fast", kind="viewer", metavar="fast|VIEWER", flags=("--for",))] = None
-    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of `aaplug guide viewers`."""
+    """Viewer that will show the scene: fast (aaplug's matched, the default) or one of `aaplug guide viewers`."""
     views: Annotated[str, VIEWS] = "test"
-    """Views that the result is measured on, by name or split; training views are what it is tuned on."""
+    """Views to measure the result on, by name or split; it is tuned on training views."""
     method: Annotated[str, names(kind="method")] = USUAL_METHOD
     """consistency: one model for all scales; group-training: the same, 60 % at a time; mipmap-gs: one scale."""
     learn_filters: bool = False
     """Learn a filter for each Gaussian at 1/2 to 1/16 and --scale, for `--recipe learned`; the Gaussians stay."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
-    """Sizes against the training size that must look right, beside the training size itself."""
+    """Sizes relative to the training size to tune for, beside the training size itself."""
     steps: Annotated[int | None, STEPS] = None
     """Number of steps (default: 1000)."""
     loss: Annotated[str, names(kind="loss"), TUNING] = "l2"
@@ -345,7 +345,7 @@ class ConformOptions(Options):
     """The expected pictures."""
 
     viewer: OneViewer = None
-    """Whose rule to expect, such as classic, mip or spark: `aaplug guide viewers` (default: the one that fits best)."""
+    """Viewer whose rule to expect, such as mip or spark: `aaplug guide viewers` (default: the one that fits best)."""
     overwrite: bool = False
     """Replace existing outputs."""
 
@@ -361,7 +361,7 @@ class BenchOptions(Options):
     )
     """Sizes of the synthetic scenes."""
     resolution: Annotated[Sequence[str] | None, Text(metavar="WxH ...", parsed=size_of, count=None)] = None
-    """Sizes of the images: all scenes at the first, the middle one at each (default: a view's or 800x800 1600x1060)."""
+    """Image sizes; only the middle scene takes all, others the first (default: the view's or 800x800 1600x1060)."""
     rasterizer: Literal["all", "compiled", "eager"] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
     repeats: Annotated[int, number(1, 1000, whole=True)] = 5

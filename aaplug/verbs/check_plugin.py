@@ -37,7 +37,7 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     """
     objects = list(_objects(module))
     if not objects:
-        raise UsageError(module, f"holds no object that has laws; these are for each {', '.join(LAWS)}")
+        raise UsageError(f"module {module}", f"holds no object that has laws; these are for each {', '.join(LAWS)}")
     tries = [(kind, name, value, law) for kind, name, value in objects for law in LAWS[kind]]
     verdicts, package = [], module.partition(".")[0]
     with monitor.progress("checking", "laws") as tell:
@@ -63,7 +63,7 @@ def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
             if point.module.partition(".")[0] == package:
                 value = vars(_imported(point.module)).get(point.attr)
                 if value is None:
-                    raise UsageError(module, f"has no {point.value}, which an entry point names")
+                    raise UsageError(f"module {module}", f"has no {point.value}, which an entry point names")
                 names.add((kind, id(value)))
                 yield kind, point.name, value
     for name, value in vars(_imported(module)).items():
@@ -79,7 +79,7 @@ def _imported(module: str) -> ModuleType:
     except (Exception, SystemExit) as error:  # a plug-in can fail in any way
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         hint = "; give the name that `import` takes, not that of the installed package" if missing else ""
-        raise UsageError(module, f"cannot be imported: {of_import(error, module)}{hint}") from error
+        raise UsageError(f"module {module}", f"cannot be imported: {of_import(error, module)}{hint}") from error
 
 
 def _is_new(kind: str, value: Any) -> bool:

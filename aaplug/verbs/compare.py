@@ -111,7 +111,7 @@ def _named(scenes: ScenesLike) -> dict[str, Scene]:
     """The scenes by name, opened; without names they get those of their files."""
     opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if len(opened) < 2:
-        problem = f"needs two scenes or more, got {len(opened)}; the first is what others are held to"
+        problem = f"needs two scenes or more, got {len(opened)}; the others are compared with the first"
         raise UsageError("compare", problem)
     if isinstance(scenes, Mapping):
         return dict(zip(scenes, opened, strict=True))

@@ -40,7 +40,7 @@ def conform(
     overwrite: bool = False,
     monitor: Monitor = SILENT,
 ) -> Conformance | None:
-    """Judge a renderer by its pictures of ten tiny scenes, and name what it does wrong; with neither, write the scenes.
+    """Test a renderer by its pictures of ten tiny scenes, and name what it draws wrong; with neither, write the scenes.
 
     A picture is 64×64 px, on black or white.  The camera is a cameras.json of 3DGS with one entry: position, and
     rotation from camera to world in OpenCV's axes; its principal point is the image's centre.
@@ -59,7 +59,7 @@ def conform(
     """
     found = find_viewer(viewer)
     if program is not None and images is not None:
-        raise UsageError("images", "and `program` both give the pictures; give one")
+        raise UsageError("images", "gives the pictures, as `program` does; give one")
     if program is None and images is None and output is None:
         raise UsageError("program", "name a program, `images`, or an `output` folder for the scenes")
     if images is not None and not os.path.isdir(images):

@@ -101,7 +101,7 @@ def check_journalled(
     asked: whether other options ask for something in the folder.
     """
     if resume and overwrite:
-        raise UsageError("resume", "and `overwrite` contradict each other; give one")
+        raise UsageError("resume", "continues a run, and `overwrite` starts anew; give one")
     if folder is None:
         for option in [name for name, is_asked in (*asked.items(), ("resume", resume)) if is_asked]:
             raise UsageError(option, "needs a folder; give `output`")

@@ -50,7 +50,7 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
     """
     opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if not opened:
-        raise UsageError("scenes", "there are none; name at least one")
+        raise UsageError("scenes", "needs at least one, got none")
     if len({scene.flat for scene in opened}) > 1:
         raise UsageError("scenes", "some hold 2D Gaussians and others do not; one file cannot hold both")
     places = list(zip(*_places(options, len(opened)), strict=True))

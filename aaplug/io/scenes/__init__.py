@@ -159,8 +159,7 @@ def read_scene(
     if format is None:
         if head.startswith((sog.ZIP_SIGNATURE, spz.GZIP_SIGNATURE)):
             raise FormatError(path, "is an archive; unpack it, and name the scene's file that was in it")
-        known = ", ".join("." + format.name for format in formats)
-        raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
+        raise FormatError(path, f"is of no known scene format; aaplug reads {', '.join(map(_ending, formats))}")
     how: dict[str, Any] = {"drop_bad": drop_bad}
     if convention is not None:
         how |= {"convention": convention, "evidence": "stated by the user"}
@@ -243,6 +242,11 @@ def written_format(path: AnyPath) -> WritableFormat | None:
     return found if isinstance(found, WritableFormat) else None
 
 
+def _ending(format: SceneFormat) -> str:
+    """The end of its files' names: a suffix, or such as meta.json the whole name."""
+    return format.name if format.name.endswith(".json") else f".{format.name}"
+
+
 def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> WritableFormat:
     """The format that will write `path`; refuses an output that cannot be written, before any work.
 
@@ -250,7 +254,7 @@ def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath]
     """
     writer = written_format(path)
     if writer is None:
-        known = [f".{format.name}" for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
+        known = [_ending(format) for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
         command = install_command(getattr(writer, "extra", writer.name))
