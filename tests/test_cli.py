@@ -124,6 +124,7 @@ REFUSED = {
     f"{BARE} --train-view 40x40 --train-rate 5": ["--train-view: sets the training rate, as --train-rate does"],
     f"{BARE} --train-rate 1e8": ["the limit is 16384 a side"],
     f"{BARE} --cameras . --orbit 4": ["--orbit: is for scenes without cameras"],
+    "check-plugin json": ["module json: holds no object that has laws"],
     f"{BARE} --test-every 4": ["--test-every: is of cameras, and there are none; name them with --cameras"],
     f"{BARE} --iteration 7": ["--iteration: is of a model folder, and scene.ply is a file"],
     f"{VIDEO} --recipe multi-scale": ["base_mask"],

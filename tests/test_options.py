@@ -107,7 +107,6 @@ REFUSED = {
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
     "evaluate s.ply -o out --show 5": "--show: selects views of the report; give --report, too",
     "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
-    "check-plugin json": "module json: holds no object that has laws",
     "bench --gaussians 1e5": "takes N ..., each a whole number 1..100000000, got 1e5",
     "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",
     "rendr s.ply": "there is no verb 'rendr'; did you mean render?",
