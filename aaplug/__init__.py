@@ -3,6 +3,19 @@
 `__init__.pyi` beside this file lists everything that is public.  Names are imported when they are first used.
 """
 
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return _imported(name)
+    except AttributeError as error:
+        if name in __all__:
+            raise
+        from aaplug.system.errors import did_you_mean
+
+        raise AttributeError(f"{error}{did_you_mean(name, __all__)}") from None

@@ -43,6 +43,17 @@ def test_an_option_that_is_none_is_refused_with_the_nearest_name():
         aaplug.render("scene.ply", scal=0.5)
 
 
+def test_a_name_that_is_gone_is_refused_with_what_takes_its_place():
+    with pytest.raises(UsageError, match="target: is no option here; it is gone, use `viewer`"):
+        aaplug.finetune("scene.ply", target="spark")  # pyright: ignore[reportCallIssue]
+    with pytest.raises(UsageError, match=r"drop_bad: .*; it is gone, use read_scene\(path, drop_bad=True\)"):
+        aaplug.render("scene.ply", drop_bad=True)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(AttributeError, match="attribute open_scene; it is gone, use read_scene"):
+        aaplug.open_scene  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(AttributeError, match=r"attribute read_scenes; did you mean read_scene\?"):
+        aaplug.read_scenes  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
 @pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"guide", "recipes", "viewers"}))  # which print alone
 def test_verbs_have_the_options_of_the_command_line(verb):
     parameters = inspect.signature(getattr(aaplug, verb.replace("-", "_"))).parameters

@@ -15,6 +15,20 @@ from types import FrameType
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
+GONE = {  # names that version 0.2 had, in CHANGELOG.md too; each with what takes its place
+    "densify_every": "`method` mipmap-gs",
+    "drop_bad": "read_scene(path, drop_bad=True)",
+    "forward_only": "fewer `repeats`",
+    "gather": "evaluate with --scheduler",
+    "keep": "`resume`",
+    "matched_interval": "matched with `rate_reference` interval",
+    "matched_sharpest": "matched with `rate_reference` sharpest",
+    "multi_scale": "aaplug.lab.multi_scale.in_one_scene",
+    "open_scene": "read_scene",
+    "read_pyramid": "read_scene",
+    "shard": "`scheduler`",
+    "target": "`viewer`",
+}
 
 
 class AaplugError(Exception):
@@ -72,7 +86,9 @@ def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """The end of a message about a misspelled name; empty if none of the names is like it."""
+    """The end of a message about an unknown name: what takes its place, or the name that is like it, or nothing."""
+    if instead := GONE.get(name.strip("-").replace("-", "_")):
+        return f"; it is gone, use {instead}"
     matches = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {matches[0]}?" if matches else ""
 
