@@ -323,7 +323,8 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         with pytest.raises(FormatError, match="damaged"):
             load(tmp_path / "damaged.pt", job)
     torch.save(torch.load(path) | {"version": 1}, tmp_path / "old.pt")
-    with pytest.raises(FormatError, match="another version: expected aaplug finetune 7, got aaplug finetune 1"):
+    said = "another version: expected aaplug finetune 7, got aaplug finetune 1; start again with `overwrite`"
+    with pytest.raises(FormatError, match=said):
         load(tmp_path / "old.pt", job)
     with pytest.raises(UsageError, match="its steps was 6, now it is 13"):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))

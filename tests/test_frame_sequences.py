@@ -58,7 +58,7 @@ def test_frames_of_another_request_are_not_continued(cli):
     for change, said in changes.items():
         cli.refused(
             f"{words} --resume {change}".replace("--scale 0.5 ", "" if "scale" in change else "--scale 0.5 "),
-            f"is of another request ({said} changed since)",
+            f"is of another request or another aaplug ({said} changed since)",
         )
     Path("out/f.json").rename("f.json")
     cli.refused(f"{words} --resume", "f.json: does not exist, which says what the frames show")

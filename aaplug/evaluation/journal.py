@@ -111,7 +111,8 @@ def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
     """Refuse to continue what was asked for otherwise; path: where that is written."""
     if changed := [*_changes(before, now)]:
         how = "repeat that request, or start again with `overwrite`, not `resume`"
-        raise UsageError(str(path), f"is of another request ({listing(changed)} changed since); {how}")
+        what = f"is of another request or another aaplug ({listing(changed)} changed since)"
+        raise UsageError(str(path), f"{what}; {how}")
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:

@@ -166,6 +166,7 @@ def load(path: Path, job: TuningJob) -> State:
         version, expected = f"{content['format']} {content.get('version', '')}".strip(), f"{FORMAT} {VERSION}"
         if version != expected:
             problem = f"is a checkpoint of another version: expected {expected}, got {printable(version)}"
+            problem += "; start again with `overwrite`, not `resume`"
             raise FormatError(path, problem)
         for key, value in job.facts.items():
             if (before := content["job"].get(key)) != value:

@@ -87,7 +87,9 @@ def read_manifest(folder: AnyPath, unfinished: bool = False) -> Manifest:
     path = Path(folder) / MANIFEST
     about = object_of(read_json(path), path, "the pyramid", f"'{KEY}'", KEY)
     version = about.get(KEY, number)
-    about.place.expect(version == VERSION, KEY, f"version {VERSION}", f"version {version:g}, of another aaplug")
+    if version != VERSION:
+        remedy = "of another aaplug; `aaplug lod --overwrite` makes the levels again"
+        raise about.place.error(f"{KEY} should be version {VERSION}, not version {version:g}, {remedy}")
     levels = []
     for entry in entries(path, "levels", about.fields.get("levels")):
         file, rate, chunks = entry.get("file", text), entry.get("rate", number), entry.value("chunks")
