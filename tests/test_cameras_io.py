@@ -844,7 +844,7 @@ class Dialect:
         return path.name == "transforms.json"
 
     def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
-        return CameraSet((), (), notes=("by the plug-in",))
+        return CameraSet((make_camera(),), (), notes=("by the plug-in",))
 
 
 def with_formats(monkeypatch, *formats):
