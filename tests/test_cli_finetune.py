@@ -90,7 +90,10 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
 
 
 def test_ctrl_c_while_the_result_is_measured_says_that_the_run_can_be_resumed(cli, monkeypatch):
-    monkeypatch.setattr("aaplug.verbs.finetune.sampling_bounds", lambda *_: signal.raise_signal(signal.SIGINT))
+    def pressed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("aaplug.verbs.finetune.sampling_bounds", pressed)
     code, _, err = cli(RUN)
     assert (code, "tuned.finetune.pt is kept; --resume continues" in err) == (130, True)
 

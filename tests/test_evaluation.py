@@ -364,5 +364,5 @@ def test_larger_truth_has_the_averages_of_the_training_size(look, views):
 def test_what_a_recipe_draws_by_is_part_of_the_request(look, views, tmp_path):
     first, changed = (task(look, views[:1], recipes=[replace(RECIPES["mip"], grid=grid)]) for grid in (1, 2))
     evaluate(first, journal=tmp_path / "journal")
-    with pytest.raises(UsageError, match=r"another request \(recipes_sha256.mip changed"):
+    with pytest.raises(UsageError, match=r"another aaplug \(recipes_sha256.mip changed"):
         evaluate(changed, journal=tmp_path / "journal", resume=True)

@@ -42,7 +42,7 @@ def test_a_torn_line_is_forgotten_and_written_again(path, end, views):
 
 
 def test_another_request_is_refused_by_what_changed(path):
-    with pytest.raises(UsageError, match=r"another request \(scales, versions.torch changed"):
+    with pytest.raises(UsageError, match=r"another aaplug \(scales, versions.torch changed"):
         Journal(path, {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}, resume=True)
 
 

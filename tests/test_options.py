@@ -113,7 +113,7 @@ REFUSED = {
     "gather out": "there is no verb 'gather'; it is gone, use evaluate with --scheduler; see `aaplug --help`",
     "evaluate s.ply --shard 1/2": "Unrecognized options: --shard; it is gone, use --scheduler; see",
     "lod s.ply -o out --keep": "--keep; it is gone, use --resume",
-    "lod s.ply -o out --multi-scale": "--multi-scale; it is gone, use aaplug.lab.multi_scale.in_one_scene",
+    "lod s.ply -o out --multi-scale": "--multi-scale; it is gone, use in_one_scene, see `aaplug guide levels`",
     "finetune s.ply -o t.ply --target spark": "--target; it is gone, use --for",
     "finetune s.ply -o t.ply --densify-every 9": "--densify-every; it is gone, use --method mipmap-gs",
     "bench --forward-only": "--forward-only; it is gone, use fewer --repeats",

@@ -23,7 +23,7 @@ GONE = {  # names that version 0.2 had, in CHANGELOG.md too; each with what take
     "keep": "`resume`",
     "matched_interval": "matched with `rate_reference` interval",
     "matched_sharpest": "matched with `rate_reference` sharpest",
-    "multi_scale": "aaplug.lab.multi_scale.in_one_scene",
+    "multi_scale": "in_one_scene, see `aaplug guide levels`",
     "open_scene": "read_scene",
     "read_pyramid": "read_scene",
     "shard": "`scheduler`",
