@@ -1,6 +1,5 @@
 """Worker pools: results in order, few items read ahead, errors that come back whole, no worker outlives its parent."""
 
-import math
 import os
 import platform
 import resource
@@ -12,7 +11,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import jaxtyping
@@ -97,14 +96,44 @@ def test_kept_memory_is_not_fetched_again():
     assert kept < usual / 10
 
 
-def test_threads_leave_a_core_to_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Two cores and one second: this process worked 0.5 s of each, another program the rest of one core.
-    readings = iter([Reading(0.0, 0.0, 0.0), Reading(1.0, 1.0, 2.0), Reading(2.0, 2.0, 3.0), Reading(3.0, 2.5, 3.7)])
-    monkeypatch.setattr(Reading, "now", lambda: next(readings))
-    monkeypatch.setattr("os.sched_getaffinity", lambda process: {0, 1}, raising=False)
-    monkeypatch.setattr("aaplug.system.cores.WINDOW_SECONDS", -math.inf)
-    cores = FreeCores()
-    assert [cores.count() for _ in range(3)] == [1, 2, 2]
+class Machine:
+    """Two cores and a clock.  waits, frame: cores that others use while this process waits, and in its 50 ms frames."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, waits: float, frame: float):
+        self.waits, self.frame, self.reading = waits, frame, Reading(0.0, 0.0, 0.0)
+        monkeypatch.setattr(Reading, "now", lambda: self.reading)
+        monkeypatch.setattr("aaplug.system.cores.time", SimpleNamespace(perf_counter=lambda: self.reading.clock))
+        monkeypatch.setattr("os.sched_getaffinity", lambda process: {0, 1}, raising=False)
+        self.cores = FreeCores()
+
+    def passes(self, seconds: float, own: float, others: float) -> None:
+        before = self.reading
+        self.reading = Reading(
+            before.clock + seconds, before.own + own * seconds, before.cores + (own + others) * seconds
+        )
+
+    def threads(self, frames: int, pause: float = 0.05) -> list[int]:
+        """The threads of each of some frames."""
+        counts = []
+        for _ in range(frames):
+            self.passes(pause, 0.0, self.waits)
+            with self.cores.watched():
+                counts.append(self.cores.count())
+                self.passes(0.05, 2.0 - self.frame, self.frame)
+        return counts
+
+
+def test_threads_leave_a_core_to_another_program_until_it_ends(monkeypatch):
+    machine = Machine(monkeypatch, waits=1.0, frame=1.0)
+    assert machine.threads(1000)[2:] == 998 * [1]
+    machine.waits = machine.frame = 0.0
+    assert machine.threads(1000)[4:] == 996 * [2]
+    machine.waits = machine.frame = 1.0
+    assert machine.threads(1, pause=60.0) == [1]
+
+
+def test_a_program_that_takes_turns_with_this_one_leaves_it_all_cores(monkeypatch):
+    assert Machine(monkeypatch, waits=2.0, frame=0.0).threads(1000).count(2) > 970
 
 
 @pytest.mark.parametrize(
