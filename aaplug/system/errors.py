@@ -5,6 +5,7 @@ Everything here reaches the terminal as one line and ends the program with exit 
 """
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -15,20 +16,20 @@ from types import FrameType
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
-GONE = {  # names that version 0.2 had, in CHANGELOG.md too; each with what takes its place
+# Names that version 0.2 had, in CHANGELOG.md too; each with what takes its place.
+GONE = {  # options, verbs and functions
     "densify_every": "`method` mipmap-gs",
     "drop_bad": "read_scene(path, drop_bad=True)",
     "forward_only": "fewer `repeats`",
     "gather": "evaluate with --scheduler",
     "keep": "`resume`",
-    "matched_interval": "matched with `rate_reference` interval",
-    "matched_sharpest": "matched with `rate_reference` sharpest",
     "multi_scale": "in_one_scene, see `aaplug guide levels`",
     "open_scene": "read_scene",
     "read_pyramid": "read_scene",
     "shard": "`scheduler`",
     "target": "`viewer`",
 }
+GONE_RECIPES = {f"matched-{each}": f"matched with `rate_reference` {each}" for each in ("interval", "sharpest")}
 
 
 class AaplugError(Exception):
@@ -80,16 +81,29 @@ def counted(number: int, noun: str) -> str:
 
 
 def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
-    """Message for a name that is none of these: ends with the one that is like it, or `otherwise`."""
+    """Message for a name that is none of these: ends with what takes its place, or the one like it, or `otherwise`."""
     known = list(names)
-    return f"'{name}' is not one of {', '.join(known)}" + (did_you_mean(str(name), known) or otherwise)
+    instead = _instead(GONE_RECIPES.get(str(name)))
+    return f"'{name}' is not one of {', '.join(known)}" + (instead or _like(str(name), known) or otherwise)
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """The end of a message about an unknown name: what takes its place, or the name that is like it, or nothing."""
-    if instead := GONE.get(name.strip("-").replace("-", "_")):
-        return f"; it is gone, use {instead}"
-    matches = difflib.get_close_matches(name, list(names), 1)
+    """The end of a message about an unknown option, verb or function: what takes its place, or the one that is like it.
+
+    An option takes the place only where it is one of the names.
+    """
+    known = list(names)
+    gone, *plain = (each.strip("-").replace("-", "_") for each in (name, *known))
+    instead = GONE.get(gone, "")
+    return _instead(instead if {*re.findall(r"`(\w+)`", instead)} <= {*plain} else None) or _like(name, known)
+
+
+def _instead(words: str | None) -> str:
+    return f"; it is gone, use {words}" if words else ""
+
+
+def _like(name: str, names: Sequence[str]) -> str:
+    matches = difflib.get_close_matches(name, names, 1)
     return f"; did you mean {matches[0]}?" if matches else ""
 
 
