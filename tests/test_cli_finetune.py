@@ -96,6 +96,10 @@ def test_ctrl_c_while_the_result_is_measured_says_that_the_run_can_be_resumed(cl
     monkeypatch.setattr("aaplug.verbs.finetune.sampling_bounds", pressed)
     code, _, err = cli(RUN)
     assert (code, "tuned.finetune.pt is kept; --resume continues" in err) == (130, True)
+    monkeypatch.setattr("aaplug.verbs.finetune.fuse_for", pressed)
+    for words, is_its_own in (("--overwrite", False), ("--resume", True)):
+        code, _, err = cli(f"{RUN} {words}")
+        assert (code, "is kept; --resume continues" in err) == (130, is_its_own)
 
 
 def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, monkeypatch, whole):

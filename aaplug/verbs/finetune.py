@@ -105,7 +105,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
-    with running(options, path, check, job.inputs), _resumable(checkpoint, job.monitor):
+    with running(options, path, check, job.inputs), _resumable(checkpoint, resumes, job.monitor):
         raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
         if options.poses:
             job = replace(job, cameras=refined(job, look, job.cameras.all)[0])
@@ -157,12 +157,17 @@ def _beside(scene: Path, kind: str) -> Path:
 
 
 @contextmanager
-def _resumable(checkpoint: Path | None, monitor: Monitor) -> Iterator[None]:
-    """Say, where Ctrl-C ends the block, that its checkpoint continues."""
+def _resumable(checkpoint: Path | None, resumes: bool, monitor: Monitor) -> Iterator[None]:
+    """Say, where Ctrl-C ends the block, that its checkpoint continues: not one of a run that this one replaces."""
+
+    def written() -> int | None:
+        return checkpoint.stat().st_mtime_ns if checkpoint is not None and checkpoint.exists() else None
+
+    before = None if resumes else written()
     try:
         yield
     except KeyboardInterrupt:
-        if checkpoint is not None and checkpoint.exists():
+        if written() not in (None, before):
             monitor.say(f"{checkpoint} is kept; --resume continues")
         raise
 
