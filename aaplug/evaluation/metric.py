@@ -118,7 +118,7 @@ class Metric:
     measure: the value for an image of 8 bits and the truth; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
     undefined: the reason why a value can be None; reports print it as a note.
-    smaller: defined below the training size alone.
+    smaller: `figure` is defined below the training size alone.
     prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
