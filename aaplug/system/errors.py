@@ -5,7 +5,6 @@ Everything here reaches the terminal as one line and ends the program with exit 
 """
 
 import difflib
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -16,8 +15,7 @@ from types import FrameType
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
-# Names that version 0.2 had, in CHANGELOG.md too; each with what takes its place.
-GONE = {  # options, verbs and functions
+GONE = {  # options, verbs and functions of version 0.2, in CHANGELOG.md too; each with what takes its place
     "densify_every": "`method` mipmap-gs",
     "drop_bad": "read_scene(path, drop_bad=True)",
     "forward_only": "fewer `repeats`",
@@ -29,7 +27,6 @@ GONE = {  # options, verbs and functions
     "shard": "`scheduler`",
     "target": "`viewer`",
 }
-GONE_RECIPES = {f"matched-{each}": f"matched with `rate_reference` {each}" for each in ("interval", "sharpest")}
 
 
 class AaplugError(Exception):
@@ -81,25 +78,15 @@ def counted(number: int, noun: str) -> str:
 
 
 def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
-    """Message for a name that is none of these: ends with what takes its place, or the one like it, or `otherwise`."""
+    """Message for a value that is none of these: ends with the one that is like it, or `otherwise`."""
     known = list(names)
-    instead = _instead(GONE_RECIPES.get(str(name)))
-    return f"'{name}' is not one of {', '.join(known)}" + (instead or _like(str(name), known) or otherwise)
+    return f"'{name}' is not one of {', '.join(known)}" + (_like(str(name), known) or otherwise)
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """The end of a message about an unknown option, verb or function: what takes its place, or the one that is like it.
-
-    An option takes the place only where it is one of the names.
-    """
-    known = list(names)
-    gone, *plain = (each.strip("-").replace("-", "_") for each in (name, *known))
-    instead = GONE.get(gone, "")
-    return _instead(instead if {*re.findall(r"`(\w+)`", instead)} <= {*plain} else None) or _like(name, known)
-
-
-def _instead(words: str | None) -> str:
-    return f"; it is gone, use {words}" if words else ""
+    """The end of a message about an unknown option, verb or function: what takes its place, or the one like it."""
+    instead = GONE.get(name.strip("-").replace("-", "_"))
+    return f"; it is gone, use {instead}" if instead else _like(name, list(names))
 
 
 def _like(name: str, names: Sequence[str]) -> str:
