@@ -36,6 +36,7 @@ REFUSED = {
     "huge window": ({"width": 100_000, "height": 100_000}, "size: is 100000x100000 px; the limit is 8192"),
     "many pixels": ({"width": 8000, "height": 8000}, "size: is 8000x8000 px"),
     "no window": ({"width": 0}, "width: takes a number from 1"),
+    "empty": ({"width": ""}, "width: takes a number from 1 to 1e+09, got nothing"),
     "half a pixel": ({"width": 1.5}, "width: takes a whole number"),
     "focal": ({"focal": 0}, "focal: takes a number"),
     "truth": ({"focal": True}, "focal: takes a number"),
@@ -43,6 +44,7 @@ REFUSED = {
     "camera": ({"at": 7}, "at: takes a number from 0 to 1"),
     "one side": ({"sides": GOOD["sides"][:1]}, "sides: takes two objects"),
     "recipe": ({"sides": [{"recipe": "evil", "quality": "best"}] * 2}, "recipe: 'evil' is not one of classic, auto"),
+    "no recipe": ({"sides": [{"recipe": "", "quality": "best"}] * 2}, "recipe: '' is not one of classic, auto"),
     "quality": ({"sides": [{"recipe": "auto", "quality": "x" * 999}] * 2}, "is not one of fast, balanced, best"),
     "paint": ({"paint": "../secret"}, "paint: '../secret' is not one of rate"),
     "background": ({"background": "red"}, "background: takes #rrggbb, got red"),
@@ -216,8 +218,9 @@ def test_a_busy_port_is_one_clear_line(address, cli):
     cli.refused(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}", said)
 
 
-def test_a_host_that_cannot_be_a_name_is_refused(seen):  # noqa: F811
-    with pytest.raises(UsageError, match="cannot be used"), serving(*seen, host=70 * "x"):
+@pytest.mark.parametrize("host", [70 * "x", "::g", "192.0.2.1"])  # no name; no address; another machine
+def test_a_host_that_cannot_be_listened_at_is_refused_by_name(seen, host):  # noqa: F811
+    with pytest.raises(UsageError, match=f"^host: {re.escape(host)} cannot be used: [a-z]"), serving(*seen, host=host):
         pass
 
 

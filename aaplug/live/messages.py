@@ -190,9 +190,9 @@ def _whole(body: Mapping[str, Any], name: str, least: int, most: int) -> int:
 def _name(body: Mapping[str, Any], name: str, choices: Sequence[str] | Mapping[str, Any]) -> str:
     value = body.get(name)
     if not isinstance(value, str) or value not in choices:
-        raise UsageError(name, not_one_of(_short(value), choices))
+        raise UsageError(name, not_one_of(str(value)[:MAX_VALUE_CHARACTERS], choices))
     return value
 
 
 def _short(value: object) -> str:
-    return str(value)[:MAX_VALUE_CHARACTERS]
+    return str(value)[:MAX_VALUE_CHARACTERS] or "nothing"

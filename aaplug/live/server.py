@@ -14,13 +14,14 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
+from errno import EADDRNOTAVAIL
 from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
 from os import sep, strerror
 from pathlib import Path
 from shutil import disk_usage
-from socket import gethostname
+from socket import gaierror, gethostname
 from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs
 
@@ -74,8 +75,10 @@ class Server:
             self._loop, self._port = self._started.result()
         except (OSError, UnicodeError) as error:
             self._thread.join()
-            code = error.errno if isinstance(error, OSError) else None  # asyncio's own words name the address once more
-            why = strerror(code).lower() if code and code > 0 else reason(error)
+            code = None if isinstance(error, gaierror | UnicodeError) else error.errno
+            why = strerror(code).lower() if code else reason(error)  # asyncio's own words name the address once more
+            if code in (None, EADDRNOTAVAIL):
+                raise UsageError("host", f"{self._host} cannot be used: {why}") from error
             raise UsageError("port", f"{self._port} of {self._host} cannot be used: {why}") from error
         return self
 
