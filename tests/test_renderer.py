@@ -110,7 +110,8 @@ def test_a_camera_set_gives_its_training_cameras_and_its_background(cameras):
     assert list(renderer.training.cameras) == cameras[:2]
     assert renderer.background == WHITE
     assert Renderer.of(scene, cameras, "classic").background == (0.0, 0.0, 0.0)
-    for background, colour in (("white", WHITE), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
+    named = {"white": WHITE, "rgb(0 51 300)": (0.0, 0.2, 1.0), "hsl(120 100% 50%)": (0.0, 1.0, 0.0)}
+    for background, colour in (*named.items(), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
         assert Renderer.of(scene, cameras, "classic", background=background).background == colour
     black, white = (
         Renderer.of(scene, cameras, "classic", background=b, rasterizer="eager")(cameras[0]) for b in ("black", "white")

@@ -11,6 +11,7 @@ which OpenCV's pixels must have.
 
 import logging
 import os
+import re
 import struct
 import tempfile
 import warnings
@@ -228,9 +229,10 @@ def colour_of(text: str, where: str = "background") -> Colour:
     Raises:
         UsageError: CSS knows no such colour; the error is at `where`.
     """
+    listed = re.sub(r"(?<=[\d%])\s+(?=\d)", ",", text)  # Pillow knows CSS's commas, not its spaces
     try:
-        red, green, blue = ImageColor.getrgb(text)  # pyright: ignore[reportAssignmentType]
+        red, green, blue = (min(max(level, 0), 255) / 255 for level in ImageColor.getrgb(listed))
     except ValueError as error:
         takes = 'auto or an opaque colour as CSS writes it, such as white, "#ff8000" or "rgb(255, 128, 0)"'
         raise UsageError(where, f"takes {takes}; got '{text[:MAX_VALUE_CHARACTERS]}'") from error
-    return red / 255, green / 255, blue / 255
+    return red, green, blue
