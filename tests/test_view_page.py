@@ -28,6 +28,12 @@ SEEN = "#picture"
 USUAL = {"color_scheme": "light", "bypass_csp": True}  # playwright's waiting evaluates strings
 ASKED = {}  # of each page, its last request
 WIDTH, HEIGHT = 900, 500  # of a window, in px
+# Gathers what a screen reader is told: the texts that change where the page says that it announces changes.
+ANNOUNCED = """() => {
+  window.announced = [];
+  for (const region of document.querySelectorAll("[role=status], [role=alert], output:not([aria-live=off])"))
+    new MutationObserver(() => announced.push(region.textContent)).observe(region, {childList: true, subtree: true});
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -437,9 +443,15 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
         page.click("#still")
     download.value.save_as(tmp_path / "still.png")
     assert read_image(tmp_path / "still.png").shape == (48, 64, 3)
+    page.evaluate(ANNOUNCED)
+    page.keyboard.press("ArrowRight")
+    at_rest(page)
     page.fill("#width", "100000")
     page.click("#still")
     page.locator("#said", has_text="size: is 100000x48 px").wait_for()
+    begun, refused = page.evaluate("announced")  # no figures of the frames before
+    assert begun == "rendering the picture"
+    assert refused.startswith("size: is 100000x48 px")
     page.fill("#width", "abc")
     page.click("#still")
     page.locator("#said", has_text="got abc").wait_for()
