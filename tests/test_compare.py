@@ -250,7 +250,8 @@ def texts(monkeypatch):
 def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
-    words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
+    write_scene("same.ply", scene)
+    words = f"compare scene.ply dim.ply same.ply {WORDS} -o out --show 1"
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "add", killed_at(2))
         assert cli(words)[0] == 130
@@ -264,15 +265,16 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     assert json.loads(cli(f"{words} --overwrite --json")[1])["guard"] == data["guard"]
     with Path("out/compare.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 2 * 3 * 3  # scenes, scales, views
+    assert len(rows) == 3 * 3 * 3  # scenes, scales, views
     assert {(row["scene"], row["compared scene"]) for row in rows} == {
-        ("scene.ply", name) for name in ("scene.ply", "dim.ply")
+        ("scene.ply", name) for name in ("scene.ply", "dim.ply", "same.ply")
     }
     page = Path("out/report.html").read_text()
     assert "aaplug comparison" in page
     assert "against the first scene" in page
     assert "differences of the Gaussians" in page
     assert "compared scene" in page
+    assert re.search(r"<b>same.ply</b> reaches <b>∞ dB</b>, dim.ply \d+\.\d\d dB", page)
     width, height = image_size(Path("out/contact-sheet.png"))
     assert width > height > 3 * 320
 

@@ -137,6 +137,12 @@ def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     return _mean(m.values.get(metric) for m in measurements)
 
 
+def figure_of(metric: Metric, measurements: Sequence[Measurement]) -> float | None:
+    """The mean as people read it: infinity where every image equals its truth and the metric is infinite there."""
+    equal = measurements and metric.undefined == EQUAL and all(EQUAL in m.note for m in measurements)
+    return math.inf if equal else mean(measurements, metric.name)
+
+
 def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
     """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
     return _mean(m.evaluations and m.evaluations / MILLION for m in report.select(recipe, scale))
@@ -243,16 +249,12 @@ def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None
 
 
 def metric_cells(report: Report, metric: Metric) -> list[list[Cell]]:
-    """A metric's table of means, recipes down and scales across; infinity where every image equals its truth."""
+    """A metric's table, recipes down and scales across."""
     columns = []
     for scale in report.scales:
         views = {recipe: report.select(recipe, scale) for recipe in report.recipes}
         spreads = {recipe: spread_of(metric, measurements) for recipe, measurements in views.items()}
-        means = {recipe: None if spread is None else spread.mean for recipe, spread in spreads.items()}
-        for recipe, measurements in views.items():
-            equal = measurements and all(EQUAL in m.note for m in measurements)
-            if equal and spreads[recipe] is None and metric.undefined == EQUAL:
-                means[recipe] = math.inf
+        means = {recipe: figure_of(metric, measurements) for recipe, measurements in views.items()}
         contenders = [value for recipe, value in means.items() if recipe != CEILING and value is not None]
         best, cells = min(contenders, key=metric.loss, default=math.nan), list[Cell]()
         for recipe, spread in spreads.items():

@@ -18,7 +18,7 @@ from aaplug.evaluation.image_store import TRUTHS, ImageStore
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.report.pages import assembled
 from aaplug.evaluation.report.plots import BOUNDS, Plot
-from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, cost_cells, mean, metric_cells, scale_name
+from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, cost_cells, figure_of, metric_cells, scale_name
 from aaplug.io.images import encoded, image_size, read_image
 
 LOSSLESS_BYTES = 12_000_000  # of all images; a larger page opens slowly and gets lossy ones
@@ -60,13 +60,17 @@ def page(
 
 
 def _headline(report: Report) -> dict[str, str] | None:
-    """Best and worst recipe at the scale farthest below the training size; None where nothing was compared."""
+    """Best and worst recipe at the scale farthest below the training size; None where nothing was compared.
+
+    A comparison's reference, which is the truth, is neither.
+    """
     for metric in report.compared[:1]:
         for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)):
-            means = {r: mean(report.select(r, scale), metric.name) for r in report.recipes}
+            means = {r: figure_of(metric, report.select(r, scale)) for r in report.recipes}
+            means.pop(report.protocol.get("reference", ""), None)
             ceiling = means.pop(CEILING, None)
             losses = {r: metric.loss(value) for r, value in means.items() if value is not None}
-            if len(losses) > 1:
+            if losses:
                 best, worst = min(losses, key=losses.__getitem__), max(losses, key=losses.__getitem__)
                 return {
                     "scale": scale_name(scale),
