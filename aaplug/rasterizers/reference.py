@@ -76,8 +76,8 @@ def composited(
 ) -> tuple[Float[Tensor, "p d"], Float[Tensor, " p"]]:
     """Premultiplied colour and transmittance of splats in their order, front to back (3DGS, eq. 3)."""
     assert splats.rgb is not None
-    rgb = centres.new_zeros(len(centres), splats.rgb.shape[1])
-    transmittance = centres.new_ones(len(centres))
+    nothing = alphas(splats[:0], centres, pixel, rules)  # so that an image without splats has gradients, too
+    rgb, transmittance = nothing @ splats.rgb[:0], 1 - nothing.sum(dim=1)
     going = torch.ones_like(transmittance, dtype=torch.bool)
     for start in range(0, len(splats), CHUNK_SPLATS):
         chunk = splats[start : start + CHUNK_SPLATS]

@@ -69,6 +69,14 @@ def test_splats_behind_a_wall_are_visible_beside_it(rasterize, splats):
     assert (alone.rgb - together.rgb).abs().amax() > 0.1
 
 
+@pytest.mark.parametrize("name", ["means", "covs", "opacities", "rgb"])
+def test_an_image_without_splats_can_be_differentiated_too(rasterize, splats, name):
+    leaf = getattr(splats, name)[:0].requires_grad_()
+    rgb, alpha = rasterize(replace(splats[:0], **{name: leaf}), HW, SKY)
+    (rgb.sum() + alpha.sum()).backward()
+    assert leaf.grad is not None
+
+
 @pytest.mark.parametrize("distance", [3.0, 100.0, 1e5, 1e9])
 def test_splats_off_the_screen_change_nothing(rasterize, splats, distance):
     # a splat of opacity 1 with sigma 0.6 px ends at 2 px
