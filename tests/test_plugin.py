@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -30,12 +31,14 @@ from aaplug.finetuning import LOSSES
 from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import SCENE_FORMATS, read_scene, write_scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.lab.gaussian_blending import GaussianBlending
 from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError, PlugInError, UsageError
 from aaplug.system.registry import Registry
+from aaplug.system.signals import _exit
 from aaplug.verbs.check_plugin import check_plugin
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.finetune import finetune
@@ -203,6 +206,10 @@ def fails(*given: Any) -> Any:
     raise KeyError("key")
 
 
+def ends(*given: Any) -> Any:
+    sys.exit("wrong")
+
+
 def spoils(thing: Any, *_: Any) -> Any:
     """Writes to its input."""
     value = thing if isinstance(thing, torch.Tensor) else next(x for x in vars(thing).values() if x is not None)
@@ -263,6 +270,7 @@ VERBS = {
 NAN = "expected finite numbers, got"
 MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
     **{(where, "raises"): (fails, "KeyError: 'key', in line") for where in VERBS},
+    **{(where, "ends the program"): (ends, "SystemExit: wrong, in line") for where in VERBS},
     ("screen filter wrong", "returns nothing"): (lambda *_: None, "should return a Splats2D, got None"),
     ("screen filter wrong", "spoils"): (spoils, "changes its input: means"),
     ("screen filter wrong", "builds"): (
@@ -298,6 +306,10 @@ MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
     ("loss wrong", "no gradient"): (lambda image, truth: image.detach().mean(), "gradient"),
     ("loss wrong", "nan"): (lambda image, truth: image.mean() * math.nan, "step 1: expected a finite number, got nan"),
     ("scene format wrong", "returns nothing"): (lambda *_: None, "should return a Scene, got None"),
+    ("scene format wrong", "loads"): (
+        lambda path, _: Scene(path, "wrong", 3, 0, fails, ""),
+        "scene.wrong with KeyError: 'key', in line",
+    ),
     ("writing scene format wrong", "writes nothing"): (lambda *_: None, "has not written"),
     ("camera format wrong", "returns a list"): (lambda *_: [make_camera()], "CameraSet, got a list of a Camera"),
 }
@@ -312,6 +324,11 @@ def test_a_plug_in_that_fails_in_a_verb_is_named(case, monkeypatch, tmp_path):
     assert problem in caught.value.problem
     if case[1] == "raises":
         assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_a_worker_that_is_told_to_end_inside_a_plug_in_ends(monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match="143"):
+        evaluated(lambda *_: _exit(signal.SIGTERM, None), monkeypatch, tmp_path)
 
 
 def test_a_camera_format_that_fails_after_another_read_the_folder_is_named(monkeypatch):

@@ -133,7 +133,7 @@ def of_system(error: BaseException | None) -> OSError | None:
     return error if isinstance(error, OSError) else None
 
 
-def is_lack_of_memory(error: Exception) -> bool:
+def is_lack_of_memory(error: BaseException) -> bool:
     """True if an error is Python's or torch's for lack of memory."""
     words = str(error) if isinstance(error, RuntimeError) else ""
     return isinstance(error, MemoryError) or any(each in words for each in MEMORY_WORDS)

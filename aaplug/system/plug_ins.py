@@ -72,7 +72,7 @@ def filtered(kind: str, filter: Callable[..., T], thing: T, *given: Any) -> T:
 
 @contextmanager
 def blaming(*parts: tuple[str, object], file: Path | None = None, code: object = None) -> Iterator[list[str]]:
-    """Turn what fails inside the block into an error that names the plug-in that it fails in.
+    """Turn what fails inside the block, or ends the program, into an error that names the plug-in that it fails in.
 
     An error that a plug-in words itself stays, and so does one about a file.  Without plug-ins nothing is changed.
     Yields kind and name of each plug-in among the parts.
@@ -86,7 +86,7 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
     theirs = {_label(*part): package for part in parts if (package := package_of(code or part[1])) != OURS}
     try:
         yield [*theirs]
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if not theirs or is_lack_of_memory(error) or _is_worded(error):
             raise
         places = {where: place_in(error, package) for where, package in theirs.items()}
@@ -97,12 +97,17 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
         raise PlugInError(where, f"fails{on} with {failure(error, theirs[where])}") from error
 
 
-def _is_worded(error: Exception) -> bool:
-    """True if an error says all: it names a plug-in or a file, or is a plug-in's own words for the user."""
+def _is_worded(error: BaseException) -> bool:
+    """True if an error says all: it names a plug-in or a file, or is a plug-in's own words for the user.
+
+    So does the end of a process that aaplug itself ends.
+    """
     if isinstance(error, PlugInError):
         return True
     *_, (last, _) = walk_tb(error.__traceback__)
-    return isinstance(error, AaplugError) and (type(error) is not UsageError or top_package(last) != OURS)
+    if top_package(last) == OURS:
+        return isinstance(error, SystemExit) or (isinstance(error, AaplugError) and type(error) is not UsageError)
+    return isinstance(error, AaplugError)
 
 
 def package_of(value: Any) -> str:

@@ -32,7 +32,8 @@ from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
-from aaplug.system.plug_ins import check_answer
+from aaplug.system.plug_ins import blaming, check_answer
+from aaplug.system.registry import registry_of
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
 FOLDER_INDEXES = ("meta.json", STREAM_INDEXES["sog"])  # each marks a folder that is a scene: of SOG images, of chunks
@@ -202,7 +203,8 @@ class Scene:
         if self.path is None:
             return self.load(start, stop)
         origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
-        with library_errors(self.path):
+        reader = registry_of("scene format").get(self.format, self.load)
+        with library_errors(self.path), blaming(("scene format", reader), file=self.path, code=self.load):
             rows = self.load(start, stop)
         check_answer(f"`load` of format {self.format}", rows, Gaussians)
         if len(rows) != stop - start:
