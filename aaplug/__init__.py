@@ -11,8 +11,11 @@ _imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
+    from aaplug.system.contracts import in_memory
+
     try:
-        return _imported(name)
+        with in_memory():  # modules have constants
+            return _imported(name)
     except AttributeError as error:
         if name in __all__:
             raise

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import torch
 from aaplug_cli.verbs import VERBS
 
 import aaplug
@@ -36,6 +37,21 @@ def test_a_renderer_applies_the_recipes_world_filter(cli):
     cli.done("render scene.ply --cameras . -o one.png --scale 0.5 --recipe mip-splatting --bit-depth 16")
     aaplug.write_png("two.png", image, bit_depth=16)
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
+
+
+def test_the_default_device_of_a_program_changes_nothing(cli, monkeypatch):
+    def made() -> list[object]:
+        scene, cameras = aaplug.read_scene("scene.ply"), aaplug.read_cameras(".")
+        aaplug.write_scene("scene.glb", scene.gaussians(), overwrite=True)
+        image = aaplug.Renderer.of(scene, cameras, rasterizer="eager")(cameras.test[0].scaled(0.5)).rgb
+        return [Path("scene.glb").read_bytes(), image.tolist(), aaplug.info(scene, cameras)]
+
+    expected = made()
+    with torch.device("meta"):
+        assert made() == expected
+    monkeypatch.setattr("aaplug._imported", lambda name: torch.zeros(1))
+    with torch.device("meta"):
+        assert aaplug.imported_late.tolist() == [0]  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_an_option_that_is_none_is_refused_with_the_nearest_name():

@@ -10,7 +10,9 @@ floating point is float32 or float64.
 import inspect
 import math
 import os
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from functools import cache, wraps
 from importlib import import_module
@@ -79,7 +81,7 @@ ANYTHING = Term(lambda value, sizes: True, "anything")
 
 
 def contract(function: F) -> F:
-    """The same function, which raises UsageError for an argument that does not fit its hint."""
+    """The same function, which raises UsageError for an argument that does not fit its hint, and works in memory."""
     names = tuple(inspect.signature(function).parameters)
     terms = dict[str, Term]()  # filled when it is called first: a hint may name a class that stands below
     in_order = list[Term]()
@@ -96,9 +98,17 @@ def contract(function: F) -> F:
         for name, value in keywords.items():
             if name in terms and not terms[name].holds(value, sizes):
                 refuse(name, value, terms[name], sizes)
-        return function(*args, **keywords)
+        with in_memory():
+            return function(*args, **keywords)
 
     return checked  # pyright: ignore[reportReturnType]
+
+
+def in_memory() -> AbstractContextManager[Any]:
+    """A block in which new tensors lie in memory, whatever device the program has made the default one."""
+    torch = sys.modules.get("torch")
+    made = getattr(torch, "empty", None)  # another thread may be importing it
+    return nullcontext() if torch is None or made is None or made(0).is_cpu else torch.device("cpu")
 
 
 def check_fields(noun: Any) -> None:

@@ -198,6 +198,7 @@ class Scene:
             return digest_of_values([frame.digest for frame in self.frames])
         return digest_of_scene(self.gaussians() if self.levels is None else self.levels.scene)
 
+    @contract
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""
         if self.path is None:
