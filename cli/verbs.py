@@ -403,7 +403,7 @@ def warmup(words: Words) -> Answer:
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> Answer:
-    """Test the filters, kernels, rasterizers, recipes, metrics and formats of a package by their laws.
+    """Test the filters, kernels, rasterizers, recipes, metrics, losses and formats of a package by their laws.
 
     For authors of plug-ins.  To measure the recipes that it adds, use evaluate.
     """

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -159,11 +160,22 @@ def test_the_laws_run_over_what_the_plug_in_adds(finished):
 def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(monkeypatch):
     module = ModuleType("imports")
     odd = replace(METRICS["PSNR"], name="odd", measure=lambda image, truth: image)
-    vars(module).update(Colour=Colour, where=np.where, maximum=np.maximum, ODD=odd)
+    vars(module).update(Colour=Colour, where=np.where, maximum=np.maximum, ODD=odd, measure=lambda image, truth: 0)
     monkeypatch.setitem(sys.modules, "imports", module)
     [verdict] = check_plugin("imports")
     assert (verdict.kind, verdict.name) == ("metric", "odd")
     assert verdict.problem.startswith("metric odd: gives no number but Tensor")
+
+
+def test_a_loss_that_an_entry_point_names_is_tried(monkeypatch):
+    module = ModuleType("losses")
+    vars(module).update(sum=lambda image, truth: (image - truth).square().sum(), mean=lambda image, truth: image.mean())
+    points = [EntryPoint(name, f"losses:{name}", "aaplug.losses") for name in ("sum", "mean")]
+    monkeypatch.setitem(sys.modules, "losses", module)
+    monkeypatch.setattr("aaplug.verbs.check_plugin.entry_points", lambda group: points * (group == "aaplug.losses"))
+    verdicts = {(name, law.partition(" ")[0]): problem for _, name, law, problem in check_plugin("losses")}
+    assert len(verdicts) == 2 * 2
+    assert [name for (name, _), problem in verdicts.items() if problem] == ["mean"]
 
 
 @dataclass(frozen=True)

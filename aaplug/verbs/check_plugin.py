@@ -55,7 +55,10 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
 
 
 def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
-    """Kind, name and value of all that has laws: what entry points of the package name, then the rest of the module."""
+    """Kind, name and value of all that has laws: what entry points of the package name, then the rest of the module.
+
+    Losses are only those that entry points name.
+    """
     package = module.partition(".")[0]
     names: set[tuple[str, int]] = set()
     for kind in LAWS:
@@ -67,7 +70,7 @@ def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
                 names.add((kind, id(value)))
                 yield kind, point.name, value
     for name, value in vars(_imported(module)).items():
-        for kind in LAWS:
+        for kind in filter("loss".__ne__, LAWS):  # functions of metrics take the same
             if not name.startswith("_") and _is_new(kind, value) and (kind, id(value)) not in names:
                 names.add((kind, id(value)))
                 yield kind, getattr(value, "name", name), value

@@ -121,6 +121,8 @@ BROKEN = {
     **dict.fromkeys(("alpha_is_exact", "rows_hold_colours", "ellipses_bound_it", "draws_the_exact_image"), Broken()),
     "composites_the_exact_image": Dimmed(),
     **dict.fromkeys(("draws_what_the_reference_draws", "keeps_its_splats"), Spoiling()),
+    "is_least_for_the_truth": lambda image, truth: image.mean(),
+    "has_gradients_of_images": lambda image, truth: (image - truth).square().mean().sqrt(),
     "is_ideal_for_the_truth": replace(METRICS["PSNR"], measure=lambda image, truth: 40.0),
     **dict.fromkeys(("tells_scenes_apart", "tells_cameras_apart"), Raising()),
     "reads_what_it_writes": Forgetful(),

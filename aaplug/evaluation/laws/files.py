@@ -1,10 +1,12 @@
-"""Laws of metrics, and of formats of scenes and cameras."""
+"""Laws of metrics and losses, and of formats of scenes and cameras."""
 
 import math
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metric import Metric
@@ -14,7 +16,7 @@ from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.locks import OUR_PREFIX
 
-from .base import law_of, make_scene, require
+from .base import F64, law_of, make_scene, require
 
 COUNT = 20  # Gaussians
 HEADS = (b"", b"\0" * 64, b"\xff" * 64, b"ply\n" + b"comment " * 8, b"PK\3\4" + bytes(60), b"{" * 64)
@@ -37,6 +39,30 @@ def is_ideal_for_the_truth(metric: Metric) -> None:
     require(close, f"the truth has {ideal} instead of {metric.ideal}")
     worse = value is None or ideal is None or metric.loss(value) > metric.loss(ideal)
     require(worse, f"noise has {value}, which is no worse than {ideal}")
+
+
+def _images(dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    return [*torch.rand(2, 12, 14, 3, generator=torch.Generator().manual_seed(0), dtype=F64).to(dtype)]
+
+
+@law_of("loss")
+def is_least_for_the_truth(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
+    """It is 0 for the truth itself, above 0 for noise, and keeps both images."""
+    image, truth = _images()
+    least, more = float(loss(truth, truth)), float(loss(image, truth))
+    require(abs(least) < 1e-6 < more < math.inf, f"is {least:g} for the truth itself, {more:g} for noise")
+    kept = all(a.equal(b) for a, b in zip((image, truth), _images(), strict=True))
+    require(kept, "changes an image")
+
+
+@law_of("loss")
+def has_gradients_of_images(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
+    """Its gradient is that of its formula, and finite for the truth itself."""
+    image, truth = _images(F64)
+    torch.autograd.gradcheck(lambda x: loss(x, truth), image.requires_grad_(), fast_mode=True)
+    same = truth.float().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(same, truth.float()), same)
+    require(gradient.isfinite().all(), "the gradient is NaN or infinite for the truth itself")
 
 
 @law_of("scene format")
