@@ -64,6 +64,7 @@ def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
     path = read_camera_path(file)
     (camera,) = path.cameras
     assert (path.fps, camera.width, camera.height) == (24, 60, 40)
+    assert read_camera_path(file, fps=48.0).fps == 24  # its frames are listed
     assert camera.fy == pytest.approx(20 / math.tan(math.pi / 6))
     assert camera.centre.tolist() == pytest.approx([0, 0, 5])
     ahead = camera.cam_from_world @ torch.tensor([0.0, 1.0, 0.0, 1.0]).double()

@@ -102,7 +102,7 @@ def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatc
 
 def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
     path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
-    monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _: path)
+    monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _, fps: path)
     Path("path.json").touch()
     cli.refused(
         f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json",

@@ -276,6 +276,20 @@ def test_usd_without_its_package_names_the_extra(tmp_path, monkeypatch):
         read_camera_path(written(tmp_path, "path.usda", USDA))
 
 
+@pytest.mark.parametrize("name", ["supersplat", "lichtfeld", "gltf", "usd"])
+def test_a_path_of_keys_lasts_as_long_at_another_frame_rate(tmp_path, name):
+    documents = {"supersplat": ("a.json", SETTINGS), "lichtfeld": ("a.json", TIMELINE), "usd": ("a.usda", USDA)}
+    if name == "usd":
+        pytest.importorskip("pxr")
+    file = glb(tmp_path) if name == "gltf" else written(tmp_path, *documents[name])
+    path = read_camera_path(file)
+    finer = read_camera_path(file, fps=2 * path.fps)
+    assert (finer.fps, finer.shutter) == (2 * path.fps, path.shutter)
+    for one, other in zip(path.cameras, finer.cameras[::2], strict=True):
+        torch.testing.assert_close(one.cam_from_world, other.cam_from_world)
+        assert one.fx == pytest.approx(other.fx)
+
+
 @pytest.mark.parametrize("name", ["colmap", "transforms", "inria", "pinhole", "blender"])
 def test_cameras_of_a_data_set_are_a_path_in_their_order(tmp_path, name):
     make, _ = FIXTURES[name]

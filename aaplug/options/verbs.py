@@ -93,7 +93,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     seconds: Annotated[float, number(0.01, 3600)] = 6.0
     """Length in seconds of a zoom, dolly or orbit."""
     fps: Annotated[float | None, number(0.1, MOST_FPS)] = None
-    """Frames per second (default: the path file's, or 30)."""
+    """Frames per second (default: the path file's, or 30); frames that a path file lists play at this rate."""
     resume: Annotated[bool, FILES] = False
     """Continue an interrupted frame sequence; finished frames are not drawn again."""
 

@@ -74,7 +74,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     built_in = str(options.path) in BUILT_IN_PATHS
     if not built_in and not os.path.exists(options.path):
         raise UsageError("path", f"takes {listing(BUILT_IN_PATHS)} or a file of cameras; there is no {options.path}")
-    file = None if built_in else read_camera_path(Path(options.path))
+    file = None if built_in else read_camera_path(Path(options.path), fps=options.fps)
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
     if sequence is None:

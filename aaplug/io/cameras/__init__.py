@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import (
@@ -32,7 +32,7 @@ from aaplug.io.cameras import (
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.photos import files_of, without_suffix
 from aaplug.io.cameras.sets import CameraFileOptions
-from aaplug.system.contracts import contract
+from aaplug.system.contracts import Range, contract
 from aaplug.system.errors import FormatError, PlugInError, UsageError, listing
 from aaplug.system.plug_ins import asked
 from aaplug.system.registry import Registry, named
@@ -116,8 +116,10 @@ def read_cameras(
 
 
 @contract
-def read_camera_path(path: str | PathLike[str]) -> CameraPath:
+def read_camera_path(path: str | PathLike[str], *, fps: Annotated[float, Range(above=0)] | None = None) -> CameraPath:
     """Read the cameras of a path in order: of a path file, or of any file or folder that `read_cameras` takes.
+
+    fps: frames per second that keyframes are sampled at, where the file has some; None for the file's own rate.
 
     Raises:
         FormatError: there are no cameras, or a file breaks its format.
@@ -126,7 +128,7 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     for format in PATH_FORMATS:
         if format.sniff(Path(path)):
             with of_file(path):
-                return format.path_of(Path(path))
+                return format.path_of(Path(path), fps)
     if os.path.exists(path) and not recognized(path):
         raise FormatError(path, "holds no camera path of a known format; `aaplug guide film-camera` lists them")
     try:

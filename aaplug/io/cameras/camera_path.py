@@ -60,8 +60,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     return replace(split, notes=(note, *split.notes))
 
 
-def path_of(path: Path) -> CameraPath:
-    """The frames of a video; raises FormatError for a file that breaks its format."""
+def path_of(path: Path, _: float | None = None) -> CameraPath:
+    """The frames of a video, as the file lists them; raises FormatError for a file that breaks its format."""
     about = object_of(read_json(path), path, "the path", f"'{KEY}', as nerfstudio writes", KEY)
     kind = about.fields.get("camera_type", PERSPECTIVE)
     about.place.expect(kind == PERSPECTIVE, "camera_type", PERSPECTIVE, kind)

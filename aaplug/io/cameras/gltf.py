@@ -32,8 +32,11 @@ def sniff(path: Path) -> bool:
     return path.suffix.lower() in (".glb", ".gltf")
 
 
-def path_of(path: Path) -> CameraPath:
-    """The camera at each frame of its animation, or at rest as a path of one frame."""
+def path_of(path: Path, fps: float | None = None) -> CameraPath:
+    """The camera at each frame of its animation, or at rest as a path of one frame.
+
+    fps: frames per second; None for the rate of even keys, else 30.
+    """
     file = Gltf(path)
     nodes = file.items("nodes")
     holders = [index for index, node in enumerate(nodes) if "camera" in node]
@@ -44,7 +47,7 @@ def path_of(path: Path) -> CameraPath:
     moved = [index for index in holders if any(node in channels for node in chains[index])]
     chosen = (moved or holders)[0]
     moving = [channel for node in chains[chosen] for channel in channels.get(node, {}).values()]
-    place, fps = nodes[chosen].place, max((_rate(times) for times, _, _ in moving), default=0.0) or FPS
+    place, fps = nodes[chosen].place, fps or max((_rate(times) for times, _, _ in moving), default=0.0) or FPS
     first, last = (pick((float(t[end]) for t, _, _ in moving), default=0.0) for pick, end in ((min, 0), (max, -1)))
     at = frame_times(first, last, fps, place)
     motions = torch.eye(4, dtype=torch.float64).expand(len(at), 4, 4)

@@ -32,8 +32,8 @@ def sniff(path: Path) -> bool:
     return mentions(path, ["focal_length_mm"]) and mentions(path, ["keyframes"])
 
 
-def path_of(path: Path) -> CameraPath:
-    """The frames of the timeline, 30 a second."""
+def path_of(path: Path, fps: float | None = None) -> CameraPath:
+    """The frames of the timeline; fps: how many a second, None for 30."""
     about = object_of(read_json(path), path, "the timeline", "'keyframes', as LichtFeld Studio writes", "keyframes")
     version = about.get("version", number, 1.0)
     about.place.expect(version in range(1, LAST_VERSION + 1), "version", f"1 to {LAST_VERSION}", version)
@@ -46,7 +46,8 @@ def path_of(path: Path) -> CameraPath:
     for key, easing, focal in zip(keys, easings, focals.tolist(), strict=True):
         key.place.expect(easing in range(len(EASINGS)), "easing", f"0 to {len(EASINGS) - 1}", easing)
         key.place.expect(focal > 0, "focal_length_mm", "above 0", focal)
-    at = frame_times(float(times[0]), float(times[-1]), FPS, about.place)
+    fps = fps or FPS
+    at = frame_times(float(times[0]), float(times[-1]), fps, about.place)
     index, after, share = segments(times, at)
     eased = torch.stack([ease(share) for ease in EASINGS])
     share = eased[torch.tensor(easings, dtype=torch.int64)[index], torch.arange(len(at))]
@@ -58,4 +59,4 @@ def path_of(path: Path) -> CameraPath:
     motions[:, :3, :3], motions[:, :3, 3] = WORLD[:, None] * turns * OPENCV_FROM_OPENGL, WORLD * points
     tangents = SENSOR_HEIGHT / 2 / focals[index].lerp(focals[after], share)
     cameras = cameras_of(motions, tangents, lambda size: size[1], about.place)
-    return CameraPath(cameras, FPS, unsized=True)
+    return CameraPath(cameras, fps, unsized=True)

@@ -33,17 +33,18 @@ def sniff(path: Path) -> bool:
     return mentions(path, ["animTracks"])
 
 
-def path_of(path: Path) -> CameraPath:
-    """The frames of the first animation."""
+def path_of(path: Path, fps: float | None = None) -> CameraPath:
+    """The frames of the first animation; fps: how many a second, None for as many as the file says."""
     about = object_of(read_json(path), path, "it", "'animTracks', as SuperSplat writes", "animTracks")
     version = about.fields.get("version", 1)
     about.place.expect(version in (1, 2), "version", "1 or 2", version)
     [track, *_] = entries(path, "track", about.fields["animTracks"])
-    fps, smoothness = track.get("frameRate", number, FPS), track.get("smoothness", number, 0.0)
-    track.place.expect(fps > 0, "frameRate", "above 0", fps)
-    frames, (times, values) = track.get("duration", number) * fps, _keys(about, track.entry("keyframes"))
-    times = rising(times * (1 if "frameRate" in track else fps), about.place)  # early files count times in s
-    at = frame_times(0.0, frames - 1, 1.0, about.place)
+    rate, smoothness = track.get("frameRate", number, FPS), track.get("smoothness", number, 0.0)
+    track.place.expect(rate > 0, "frameRate", "above 0", rate)
+    frames, (times, values) = track.get("duration", number) * rate, _keys(about, track.entry("keyframes"))
+    times = rising(times * (1 if "frameRate" in track else rate), about.place)  # early files count times in s
+    fps = fps or rate
+    at = frame_times(0.0, frames * (fps / rate) - 1, 1.0, about.place) * (rate / fps)
     inside = times < frames
     if track.fields.get("loopMode") == "repeat" and inside.sum() > 1:  # between copies a round earlier and later
         times, values = times[inside], values[inside].repeat(3, 1)

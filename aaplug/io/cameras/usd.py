@@ -31,19 +31,19 @@ def sniff(path: Path) -> bool:
     return path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz")
 
 
-def path_of(path: Path) -> CameraPath:
-    """The camera at each time code, or at rest as a path of one frame."""
+def path_of(path: Path, fps: float | None = None) -> CameraPath:
+    """The camera at each frame, or at rest as a path of one; fps: how many a second, None for the stage's own."""
     try:
         Tf = module("Tf")
     except ImportError as error:
         raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}") from error
     try:
-        return _read(path)
+        return _read(path, fps)
     except (Tf.ErrorException, UnicodeDecodeError) as error:  # its message may be no text
         raise FormatError(path, "cannot be read: it breaks the format of USD") from error
 
 
-def _read(path: Path) -> CameraPath:
+def _read(path: Path, fps: float | None) -> CameraPath:
     Usd, UsdGeom = module("Usd"), module("UsdGeom")
     _check_layers(path)
     stage = Usd.Stage.Open(str(path))
@@ -55,8 +55,9 @@ def _read(path: Path) -> CameraPath:
     times, moving = [Usd.TimeCode.EarliestTime()], _moves(camera)
     codes = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
     authored = stage.HasAuthoredMetadata("framesPerSecond")
-    fps = number(stage.GetFramesPerSecond(), place, "framesPerSecond") if authored else codes
-    place.expect(codes > 0 and fps > 0, "frames and time codes per second", "above 0", [fps, codes])
+    rate = number(stage.GetFramesPerSecond(), place, "framesPerSecond") if authored else codes
+    place.expect(codes > 0 and rate > 0, "frames and time codes per second", "above 0", [rate, codes])
+    fps = fps or rate
     if stage.HasAuthoredTimeCodeRange() and moving:
         first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
         steps = (last - first) * fps / codes
@@ -66,7 +67,7 @@ def _read(path: Path) -> CameraPath:
         raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
     named = zip(numbered(len(times)), times, strict=True)
     cameras, shutters = zip(*(_camera(name, camera, time, place) for name, time in named), strict=True)
-    shutter = shutters[0] * fps / codes
+    shutter = shutters[0] * rate / codes
     return CameraPath(cameras, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
 
 
