@@ -3,6 +3,7 @@
 import errno
 import heapq
 import json
+import os
 import pickle
 import re
 import shutil
@@ -190,6 +191,18 @@ def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, 
         compared.clear()
         assert compiled._is_sound(kernel, compiled.package_path(kernel))
         assert not compared
+
+
+@linux
+def test_a_library_that_ended_a_process_is_left_aside(copied_cache, monkeypatch, caplog):
+    kernel = binning.PAIRS
+    compiled.package_path(kernel).with_suffix(".so.sha256").unlink(missing_ok=True)
+    monkeypatch.setattr(compiled, "_opened", lambda library: os._exit(9))
+    if not (child := os.fork()):
+        compiled.package_of(kernel)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    assert compiled.package_of(kernel) is None
+    assert "a process that loaded it died; images are drawn eagerly" in caplog.text
 
 
 DRAWS = """if True:

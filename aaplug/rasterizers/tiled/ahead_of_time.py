@@ -4,9 +4,10 @@ Each kernel becomes one package of `torch._inductor`.  Its file's name holds a h
 by: the kernel's own sources (`tiled.sources`), torch, its options, the compiler and the processor.  So a stale package
 is never loaded, and a change of one kernel rebuilds that one.
 
-Beside the package lies the library that was unpacked from it, once for all processes, and the hash of that library if
-its results equalled the eager ones.  A library with another hash is unpacked and compared again.  A kernel that cannot
-be used is left aside with a warning: images, or their gradients, are then computed eagerly.
+Beside the package lies the library that was unpacked from it, once for all processes, and a mark: the hash of that
+library if its results equalled the eager ones.  A library with another hash is unpacked and compared again.  A kernel
+that cannot be used is left aside with a warning: images, or their gradients, are then computed eagerly.  So is one that
+ended the first process that loaded it, which is most often the one that compiled it.
 
 A bundle is a folder of packages for an instruction set instead of one processor.  `AAPLUG_KERNELS` names it on machines
 that have no compiler.
@@ -23,8 +24,8 @@ import sys
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -47,7 +48,7 @@ from aaplug.rasterizers.tiled.sources import sources_of
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import UsageError, reason
 from aaplug.system.executors import Processes, given_threads, torch_threads
-from aaplug.system.locks import scratch
+from aaplug.system.locks import lock, scratch
 from aaplug.system.monitor import Tell
 
 IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
@@ -111,6 +112,8 @@ SCHEDULING = ("-fschedule-insns", "-fschedule-insns -fsched-pressure")
 MANY_REGISTERS = "AVX512"  # 32 of vectors; without it there are 16, and g++ has to count them wherever it schedules
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
+TRIED = "tried "  # before a library's hash in its mark: a process is loading it for the first time, or died of that
+DEADLY = "a process that loaded it died"
 LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MAX_PROCESSES = 4  # compilers side by side: each takes most of a GB
@@ -284,10 +287,11 @@ def _build_all(
     A kernel that torch cannot compile leaves no other unbuilt.
     """
     costs = [SLOW.get(kernel.name, 1) for kernel, _ in wanted]
+    paths = [package_path(kernel) if target is None else _path_in(folder, kernel, target) for kernel, target in wanted]
     left = {
         (kernel.name, target): cost
-        for (kernel, target), cost in zip(wanted, costs, strict=True)
-        if not _is_sound(kernel, package_path(kernel) if target is None else _path_in(folder, kernel, target))
+        for (kernel, target), cost, path in zip(wanted, costs, paths, strict=True)
+        if not _is_sound(kernel, path)
     }
     # the longest come first, so that none is left over at the end
     left = dict(sorted(left.items(), key=lambda item: -item[1]))
@@ -305,11 +309,18 @@ def _build_all(
         problems: dict[str, str] = {}
         with scratch() as temporary:
             build_one = partial(_build, folder, tuple(recipes), str(temporary))
-            for package, problem in pool.map(build_one, tuple(left)):
-                del left[package]
-                tell(processes)
-                if problem:
-                    problems[package[0]] = problem
+            try:
+                for package, problem in pool.map(build_one, tuple(left)):
+                    del left[package]
+                    tell(processes)
+                    if problem:
+                        problems[package[0]] = problem
+            except UsageError:  # a process died, perhaps of what it built
+                problems |= {
+                    kernel.name: DEADLY for (kernel, _), path in zip(wanted, paths, strict=True) if _is_deadly(path)
+                }
+                if not problems:
+                    raise
         if problems:
             names, problem = ", ".join(sorted(problems)), next(iter(problems.values()))
             raise UsageError("warmup", f"torch {torch.__version__} cannot compile {names} here: {problem}")
@@ -331,6 +342,15 @@ def package_of(kernel: Kernel) -> Package | None:
         return None
 
 
+def _library_and_mark(package: Path) -> tuple[Path, Path]:
+    return cache_folder() / f"{package.stem}.so", cache_folder() / f"{package.stem}.so.sha256"
+
+
+def _is_deadly(package: Path) -> bool:
+    mark = _library_and_mark(package)[1]
+    return mark.is_file() and mark.read_text().startswith(TRIED)
+
+
 def _is_sound(kernel: Kernel, package: Path) -> bool:
     with suppress(UsageError):
         return bool(_compared(kernel, package))
@@ -342,7 +362,7 @@ def _compared(kernel: Kernel, package: Path) -> Run:
 
     Raises UsageError if it is not built, cannot be unpacked or loaded, or has other results.
     """
-    library, mark = (cache_folder() / (package.stem + suffix) for suffix in (".so", ".so.sha256"))
+    library, mark = _library_and_mark(package)
     try:
         if mark.is_file() and library.is_file() and mark.read_text() == digest_of_files([library]):
             return _opened(library)
@@ -350,21 +370,41 @@ def _compared(kernel: Kernel, package: Path) -> Run:
         with zipfile.ZipFile(package) as members, scratch(str(library.parent)) as folder:
             [name] = [name for name in members.namelist() if name.endswith(LIBRARY_SUFFIXES)]
             (folder / library.name).write_bytes(members.read(name))
-            (folder / mark.name).write_text(digest_of_files([folder / library.name]))
-            mark.unlink(missing_ok=True)
+            digest = digest_of_files([folder / library.name])
             os.replace(folder / library.name, library)
+        with _trial(mark, digest), torch.no_grad(), torch_threads(1):  # several threads would wait for each other
             run = _opened(library)
-            with torch.no_grad(), torch_threads(1):  # several threads would wait for each other
-                args, twins = kernel.example(), kernel.example()
-                results = [*run(list(args)), *args]  # with the arguments that are updated in place
-                expected = [*kernel.function(*twins), *twins]
-                if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
-                    raise ValueError("its results differ from those of eager code")
-            os.replace(folder / mark.name, mark)
-            return run
+            args, twins = kernel.example(), kernel.example()
+            results = [*run(list(args)), *args]  # with the arguments that are updated in place
+            expected = [*kernel.function(*twins), *twins]
+            if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
+                raise ValueError("its results differ from those of eager code")
+        return run
     except Exception as error:  # a broken library can fail in any way
         [problem, *_] = reason(error).splitlines() or [type(error).__name__]
         raise UsageError(f"kernel {kernel.name}", f"cannot be used: {problem}") from error
+
+
+@contextmanager
+def _trial(mark: Path, digest: str) -> Iterator[None]:
+    """Mark a library as tried for the time of the block, then as sound.
+
+    Raises ValueError if a process died inside the block: loading the library would end this one, too.
+    """
+    with open(mark, "a+", encoding="ascii") as file:
+        lock(file.fileno(), wait=True)  # another process may be trying it
+        file.seek(0)
+        if file.read() == TRIED + digest:
+            raise ValueError(DEADLY)
+        file.truncate(0)
+        print(TRIED + digest, end="", file=file, flush=True)
+        outcome = ""
+        try:
+            yield
+            outcome = digest
+        finally:
+            file.truncate(0)
+            file.write(outcome)
 
 
 def _opened(library: Path) -> Run:
@@ -405,7 +445,8 @@ def _build(
             made = torch._inductor.aoti_compile_and_package(
                 program, package_path=str(scratched / "k.pt2"), inductor_configs=_configs(kernel, target)
             )
-            (cache_folder() / f"{path.stem}.so").unlink(missing_ok=True)  # of the package that is replaced
+            for each in _library_and_mark(path):  # of the package that is replaced
+                each.unlink(missing_ok=True)
             os.replace(made, path)
         _compared(kernel, path)
         return package, ""
