@@ -33,6 +33,7 @@ from aaplug.gsplat.discs import normals_of_depth
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
+from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
@@ -865,6 +866,12 @@ def test_what_is_wrong_or_not_supported_is_said(function, message, wrong):
         function(**gaussians() | two_views() | wrong)
     message = re.sub(r"expected \[(\*b[^]]*)\]", r"expected a tensor [\1] of float32 or float64", message)
     assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(("dtype", "device"), [(F64, "cpu"), (torch.float32, "cuda")])
+def test_nothing_is_compiled_for_tensors_that_no_kernel_takes(dtype, device, caplog):
+    assert rasterizer_of.__wrapped__("auto", dtype, device) is RASTERIZERS["eager"]
+    assert "drawn eagerly" in caplog.text
 
 
 @pytest.mark.parametrize(("dtype", "later"), [(F64, ""), (torch.float32, ", and compiles it meanwhile")])

@@ -145,7 +145,7 @@ def rates_in_chunks(
     origin = mean_position(cameras)
     poses = torch.stack([camera.cam_from_world for camera in cameras])
     offset = poses[:, :3, 3] + poses[:, :3, :3] @ origin
-    rotation, offset = poses[:, :3, :3].to(means), offset.to(means)
+    rotation, offset, origin = poses[:, :3, :3].to(means), offset.to(means), origin.to(means.device)
     intrinsics = [[c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.focal] for c in cameras]
     fx, fy, cx, cy, width, height, focal = means.new_tensor(intrinsics).T
     step = max(1, CHUNK_PAIRS // len(cameras))

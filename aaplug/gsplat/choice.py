@@ -9,6 +9,7 @@ from torch import Tensor
 
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernel, Kernels, Runner
+from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.on_demand import BUILT_BY_NAME
@@ -19,10 +20,16 @@ log = logging.getLogger("aaplug")
 
 
 @cache
-def rasterizer_of(name: str, precision: torch.dtype) -> Rasterizer:
-    """A rasterizer by name for what a program draws; kernels are loaded and checked once, not for every image."""
-    if (name, precision) == ("auto", torch.float64):
-        log.warning("float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast")
+def rasterizer_of(name: str, precision: torch.dtype, device: str) -> Rasterizer:
+    """A rasterizer by name for what a program draws; kernels are loaded and checked once, not for every image.
+
+    precision, device: of the Gaussians; only float32 on the CPU has compiled kernels.
+    """
+    if name == "auto" and (precision, device) != (torch.float32, "cpu"):
+        on_cpu = "float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast"
+        elsewhere = f"tensors on {device} are drawn eagerly; gsplat's own kernels are far faster there"
+        log.warning(on_cpu if device == "cpu" else elsewhere)
+        return RASTERIZERS["eager"]
     found = find_rasterizer(name, None, gradients=True)
     if name != "compiled":
         return found

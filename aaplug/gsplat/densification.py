@@ -31,9 +31,8 @@ def compute_relocation(
     ratios: N, taken as 1 … `most`.  binoms: gsplat's table; only its side is read.
     """
     counts, orders = ratios.clamp(1, len(binoms)), range(1, len(binoms) + 1)
-    choices = torch.tensor([[math.comb(n, k) for k in orders] for n in orders], dtype=torch.float64)
-    j = torch.tensor(orders, dtype=torch.float64)
     old = opacities.double().clamp(max=MAX_OPACITY)
+    choices, j = old.new_tensor([[math.comb(n, k) for k in orders] for n in orders]), old.new_tensor(orders)
     new = 1 - (1 - old) ** (1 / counts.double())
     factors = old / -((choices / j.sqrt())[counts - 1] * (-new[:, None]) ** j).sum(dim=1)
     return new.to(opacities), scales * factors[:, None].to(scales)

@@ -115,7 +115,7 @@ def normals_of_depth(depth: Float[Tensor, "h w 1"], camera: Camera) -> Float[Ten
 
     They are those of central differences of its points in the world.
     """
-    y, x = (torch.arange(side, dtype=depth.dtype) + 0.5 for side in depth.shape[:2])
+    y, x = (torch.arange(side, dtype=depth.dtype, device=depth.device) + 0.5 for side in depth.shape[:2])
     y, x = torch.meshgrid((y - camera.cy) / camera.fy, (x - camera.cx) / camera.fx, indexing="ij")
     rays = torch.stack([x, y, torch.ones_like(x)], dim=2)
     points = (rays * depth) @ torch.linalg.inv(camera.cam_from_world[:3, :3]).T.to(depth)

@@ -135,7 +135,7 @@ def rasterization(
     refuse({"sparse_grad": sparse_grad, "distributed": distributed, "with_eval3d": with_eval3d, **others})
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options, (radial_coeffs, tangential_coeffs, thin_prism_coeffs))
-    painter = rasterizer_of(rasterizer, means.dtype) if isinstance(rasterizer, str) else rasterizer
+    painter = rasterizer_of(rasterizer, means.dtype, means.device.type) if isinstance(rasterizer, str) else rasterizer
     kernels = kernels_of(painter)
     splats, radii = zip(*(splats_of(view, options, kernels) for view in views), strict=True)
     layout = Layout.of([part.sources for part in splats], viewmats.shape[:-2], means.shape[-2], packed)

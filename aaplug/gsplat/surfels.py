@@ -90,7 +90,7 @@ def rasterization_2dgs(
         *("classic", "classic", max_alpha),
     )
     views = views_of(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, None, None, options)
-    painter = rasterizer_of(rasterizer, means.dtype) if isinstance(rasterizer, str) else rasterizer
+    painter = rasterizer_of(rasterizer, means.dtype, means.device.type) if isinstance(rasterizer, str) else rasterizer
     parts = [Discs.of(view, options) for view in views]
     layout = Layout.of([part.sources for part in parts], viewmats.shape[:-2], means.shape[-2], packed)
     transforms = layout.column([part.transforms for part in parts])

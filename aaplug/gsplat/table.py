@@ -37,13 +37,17 @@ class Layout:
     def of(cls, sources: Sequence[Tensor], shape: torch.Size, gaussians: int, packed: bool) -> "Layout":
         """The layout of the splats of all images, from each image's `sources`."""
         counts = [len(part) for part in sources]
-        images = torch.repeat_interleave(torch.tensor(counts))
+        images = torch.repeat_interleave(torch.tensor(counts, device=sources[0].device))
         return cls(shape, gaussians, packed, counts, images, torch.cat(list(sources)))
 
     @property
     def rows(self) -> Int[Tensor, " s"]:
         """Row of each splat."""
-        return torch.arange(len(self.sources)) if self.packed else self.images * self.gaussians + self.sources
+        return (
+            torch.arange(len(self.sources), device=self.sources.device)
+            if self.packed
+            else self.images * self.gaussians + self.sources
+        )
 
     def column(self, values: Sequence[Tensor]) -> Tensor:
         """A column of the table, from the values of each image's splats."""

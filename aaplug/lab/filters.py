@@ -70,8 +70,8 @@ def view_information(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> 
 
     Along u, uᵀ M u is the summed squared rate; a camera adds nothing along its own ray d.  0 if no camera sees it.
     """
-    origin = mean_position(cameras)
-    eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
+    origin = mean_position(cameras).to(means.device)
+    eyes = torch.stack([camera.centre.to(origin) - origin for camera in cameras]).to(means)
     information = means.new_zeros(len(means), 3, 3)
     for part, rates in rates_in_chunks(means, cameras):
         local = (means[part].double() - origin).to(means)

@@ -74,7 +74,7 @@ def expected(
         channels["depth"] = torch.cat([depths - (growth * splats.means).sum(dim=1, keepdim=True), growth], dim=1)
     if "normal" in names:
         normals = thinnest_axes(scene, sources).to(depths)
-        sights = (scene.means.index_select(0, sources).double() - camera.centre).to(depths)
+        sights = (scene.means.index_select(0, sources).double() - camera.centre.to(depths.device)).to(depths)
         if camera.lens.projection == "ortho":
             sights = camera.cam_from_world[2, :3].to(depths)
         normals = torch.where((normals * sights).sum(dim=1, keepdim=True) > 0, -normals, normals)
@@ -107,7 +107,9 @@ def expected(
     if "normal" in found:
         found["normal"] = normalize(found["normal"], dim=2)
     if "position" in found:
-        found["position"] = torch.where(covered, found["position"].double() + camera.centre, 0.0).to(means)
+        found["position"] = torch.where(covered, found["position"].double() + camera.centre.to(means.device), 0.0).to(
+            means
+        )
     return {name: part if part.shape[2] > 1 else part[..., 0] for name, part in found.items()}
 
 

@@ -298,7 +298,8 @@ class Renderer:
 
             found |= by_order(names, splats, samples, draw_by_order)
             if "id" in found and self.scene.origin is not None:
-                found["id"] = torch.where(found["id"] < 0, found["id"], self.scene.origin.rows[found["id"]])
+                rows = self.scene.origin.rows.to(found["id"].device)
+                found["id"] = torch.where(found["id"] < 0, found["id"], rows[found["id"]])
         return {name: found[name] for name in names}
 
     @contract
