@@ -1,5 +1,7 @@
 """The public API, on one page."""
 
+__version__: str
+
 # read and write
 from .io.cameras import read_camera_path as read_camera_path, read_cameras as read_cameras
 from .io.images import read_image as read_image, write_png as write_png

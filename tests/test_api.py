@@ -80,7 +80,9 @@ def test_verbs_have_the_options_of_the_command_line(verb):
         assert not keyword or parameter.default is not inspect.Parameter.empty, name
 
 
-def test_every_folder_of_the_library_is_packaged():
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+def test_the_version_and_every_folder_of_the_library_are_packaged():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert aaplug.__version__ == stated["project"]["version"]
+    listed = stated["tool"]["setuptools"]["packages"]
     folders = {".".join(file.parent.relative_to(ROOT).parts) for file in ROOT.glob("aaplug/**/__init__.py")}
     assert set(listed) == folders | {"aaplug_cli", "aaplug_cli.guides"}
