@@ -711,6 +711,15 @@ def test_gsplats_own_markov_chain_runs():
     assert (params["opacities"].sigmoid() > 0.19).all()
 
 
+def test_opacities_may_be_a_column():
+    """As nerfstudio's parameters are."""
+    opacities, scales, counts = torch.rand(5), torch.rand(5, 3), torch.arange(5)
+    expected, widths = compute_relocation(opacities, scales, counts, torch.zeros(51, 51))
+    columns, same = compute_relocation(opacities[:, None], scales, counts, torch.zeros(51, 51))
+    assert columns.equal(expected[:, None])
+    assert same.equal(widths)
+
+
 @pytest.mark.parametrize("copies", [1, 2, 7, 51])
 def test_relocated_copies_look_like_one(copies):
     opacities, scales = torch.tensor([0.01, 0.5, 0.99, 1.0]), torch.rand(4, 3)
@@ -757,7 +766,7 @@ def stand_in(monkeypatch) -> Callable[..., ModuleType]:
 @pytest.fixture
 def homes(stand_in) -> dict[str, ModuleType]:
     """Modules of gsplat's names, as if it were installed, whose functions do nothing."""
-    stand_in("gsplat", __path__=[])
+    stand_in("gsplat", __path__=[], __version__="1.10.0")
     return {
         home: stand_in(home, **{ours.__name__: lambda: None for ours in functions})
         for home, functions in REPLACED.items()
@@ -777,13 +786,17 @@ def test_patch_replaces_functions_wherever_they_are_held_until_it_is_closed(stan
     assert trainer.rasterization is rasterization
 
 
-@pytest.mark.parametrize("missing", ["module", "function"])
-def test_patch_says_what_it_needs(monkeypatch, homes, missing):
+@pytest.mark.parametrize(
+    ("missing", "said"), [("module", "gsplat.rendering"), ("function", "rasterization"), ("version", "this is 1.4.0")]
+)
+def test_patch_says_what_it_needs(monkeypatch, homes, missing, said):
     if missing == "module":
         monkeypatch.setitem(sys.modules, "gsplat.rendering", None)
-    else:
+    elif missing == "function":
         del homes["gsplat.rendering"].rasterization
-    with pytest.raises(UsageError, match=r"^patch: expected gsplat 1.5 or newer \(`pip install gsplat`"):
+    else:  # whose strategies read one radius for each splat, and would fail in training
+        monkeypatch.setattr(sys.modules["gsplat"], "__version__", "1.4.0")
+    with pytest.raises(UsageError, match=rf"^patch: expected gsplat 1.5 or newer \(`pip install [^`]*1.5.*{said}"):
         patch()
 
 
@@ -799,6 +812,8 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "colors: expected shape [2, 40, 3], got [3, 40, 3]": {"colors": torch.ones(3, 40, 3)},
     "colors: expected shape [40, 9, 3], got [40, 9, 4]": {"colors": torch.ones(40, 9, 4), "sh_degree": 2},
     "sh_degree: 3 needs 16 coefficients, colors has 9": {"colors": torch.ones(40, 9, 3), "sh_degree": 3},
+    "colors: expected a tensor [*b, n, d], got float64 [40]": {"colors": torch.ones(40, dtype=F64)},
+    "colors: expected a tensor [*b, n, k, 3] for sh_degree 0, got float64 [40, 3]": {"sh_degree": 0},
     "viewmats: expected [*b, c, 4, 4], got float32 [2, 3, 4]": {"viewmats": torch.zeros(2, 3, 4)},
     "Ks: expected [*b, c, 3, 3], got float32 [1, 3, 3], c = 2": {"Ks": torch.eye(3)[None]},
     "viewmats: expected a tensor": {"viewmats": torch.eye(4)},
@@ -841,6 +856,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
         "thin_prism_coeffs": torch.ones(2, 4),
         "camera_model": "fisheye",
     },
+    "rolling_shutter: only GLOBAL is supported on the CPU, got 'TOP'": {"rolling_shutter": Enum("Rows", ["TOP"]).TOP},
     "viewmats_rs: only None is supported": {"viewmats_rs": torch.zeros(2, 4, 4)},
     "colors: expected colours for render_mode RGB, got None": {"colors": None},
     "masks: expected shape [2, 28, 40], got [2, 4, 5]": {"masks": torch.ones(2, 4, 5, dtype=torch.bool)},

@@ -160,7 +160,8 @@ def refuse(others: Mapping[str, object]) -> None:
         else:
             same = value == default or not (value or default)
         if not same:
-            words = f"only {default} is supported on the CPU, got {described(value)}"
+            got = described(value.name if isinstance(value, Enum) else value)
+            words = f"only {default} is supported on the CPU, got {got}"
             raise UsageError(name, words)
 
 
@@ -202,7 +203,8 @@ def views_of(
             raise UsageError("colors", f"expected colours for render_mode {options.render_mode}, got None")
         colors, backgrounds = opacities[..., None], None
     if colors.dim() < len(batch) + (2 if degree is None else 3):
-        raise UsageError("colors", f"expected a row of channels for each Gaussian, got {list(colors.shape)}")
+        wanted = "[*b, n, d]" if degree is None else f"[*b, n, k, 3] for sh_degree {degree}"
+        raise UsageError("colors", f"expected a tensor {wanted}, got {described(colors)}")
     channels = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
     per_camera = colors.dim() == len(batch) + 2 + len(channels)
     check_shape("colors", colors, (*batch, *((c,) if per_camera else ()), n, *channels))

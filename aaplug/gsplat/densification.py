@@ -18,24 +18,25 @@ MAX_OPACITY = 1 - torch.finfo(torch.float32).eps  # nearer to 1 the sum of `comp
 
 @contract
 def compute_relocation(
-    opacities: Float[Tensor, " n"],
+    opacities: Float[Tensor, " n"] | Float[Tensor, "n 1"],
     scales: Float[Tensor, "n 3"],
     ratios: Int[Tensor, " n"],
     binoms: Float[Tensor, "most most"],
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+) -> tuple[Float[Tensor, " n"] | Float[Tensor, "n 1"], Float[Tensor, "n 3"]]:
     """Opacities and scales with which N copies of a Gaussian look like one of it (3DGS-MCMC, eq. 9).
 
     With o' = 1 - (1 - o)^(1/N), scales are multiplied by o / Σ_j C(N, j) (-1)^(j-1) o'^j / √j, j = 1 … N.  This is the
     paper's double sum, by Σ_i C(i-1, j-1) = C(N, j).
 
-    ratios: N, taken as 1 … `most`.  binoms: gsplat's table; only its side is read.
+    opacities: also a column, as nerfstudio's parameters are.  ratios: N, taken as 1 … `most`.  binoms: gsplat's table;
+    only its side is read.
     """
     counts, orders = ratios.clamp(1, len(binoms)), range(1, len(binoms) + 1)
-    old = opacities.double().clamp(max=MAX_OPACITY)
+    old = opacities.double().flatten().clamp(max=MAX_OPACITY)
     choices, j = old.new_tensor([[math.comb(n, k) for k in orders] for n in orders]), old.new_tensor(orders)
     new = 1 - (1 - old) ** (1 / counts.double())
     factors = old / -((choices / j.sqrt())[counts - 1] * (-new[:, None]) ** j).sum(dim=1)
-    return new.to(opacities), scales * factors[:, None].to(scales)
+    return new.to(opacities).view_as(opacities), scales * factors[:, None].to(scales)
 
 
 @contract

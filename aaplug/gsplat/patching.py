@@ -1,6 +1,7 @@
 """aaplug in the place of gsplat, for programs that import gsplat themselves."""
 
 import importlib
+import re
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -15,6 +16,7 @@ REPLACED: dict[str, list[Callable[..., Any]]] = {  # by the modules that define 
     "gsplat.relocation": [compute_relocation],
     "gsplat.cuda._wrapper": [quat_scale_to_covar_preci],
 }
+OLDEST = [1, 5]  # version of gsplat whose strategies read a radius along each axis, as `meta` has
 
 
 def patch() -> ExitStack:
@@ -27,16 +29,19 @@ def patch() -> ExitStack:
         What undoes it, by `close()` or at the end of a `with` block.
 
     Raises:
-        UsageError: gsplat is not installed, or has no such functions.
+        UsageError: gsplat is not installed, is older than 1.5, or has no such functions.
     """
     pairs = []
-    for home, functions in REPLACED.items():
-        try:
+    try:
+        version = importlib.import_module("gsplat").__version__
+        if [int(number) for number in re.findall(r"\d+", version)[:2]] < OLDEST:
+            raise ImportError(f"this is {version}")
+        for home, functions in REPLACED.items():
             module = importlib.import_module(home)
             pairs += [(getattr(module, ours.__name__), ours) for ours in functions]
-        except (ImportError, AttributeError) as error:
-            problem = f"expected gsplat 1.5 or newer (`pip install gsplat`, no GPU needed): {error}"
-            raise UsageError("patch", f"{problem}; without it, import from aaplug.gsplat") from error
+    except (ImportError, AttributeError) as error:
+        problem = f"expected gsplat 1.5 or newer (`pip install 'gsplat>=1.5'`, no GPU needed): {error}"
+        raise UsageError("patch", f"{problem}; without it, import from aaplug.gsplat") from error
     undo = ExitStack()
     for module in list(sys.modules.values()):
         for name, held in list(getattr(module, "__dict__", {}).items()):
