@@ -30,6 +30,7 @@ from aaplug.gsplat.arguments import FIXED
 from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
 from aaplug.gsplat.discs import normals_of_depth
+from aaplug.gsplat.harmonics import spherical_harmonics
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
@@ -745,6 +746,22 @@ def test_covariances_and_their_inverses():
     xx, xy, xz, yy, yz, zz = triangle.unbind(dim=-1)
     torch.testing.assert_close(torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).unflatten(-1, (3, 3)), sigma)
     assert nothing is None
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_harmonics_equal_gsplats(reference, degree):
+    dirs, coefficients = (torch.randn(2, 7, *shape, dtype=F64, requires_grad=True) for shape in ((3,), (25, 3)))
+    ours, theirs = (f(degree, dirs, coefficients) for f in (spherical_harmonics, reference._spherical_harmonics))
+    torch.testing.assert_close(ours, theirs)
+    weights = torch.randn(2, 7, 3, dtype=F64)
+    words = {"allow_unused": True, "materialize_grads": True}
+    gradients = [torch.autograd.grad((x * weights).sum(), [dirs, coefficients], **words) for x in (ours, theirs)]
+    torch.testing.assert_close(*gradients)
+    masks = torch.rand(2, 7) < 0.5
+    masked = spherical_harmonics(degree, dirs, coefficients, masks=masks)
+    assert masked.equal(ours * masks[..., None])
+    with pytest.raises(UsageError, match=rf"^degrees_to_use: {degree} needs {(degree + 1) ** 2} coefficients"):
+        spherical_harmonics(degree, dirs, coefficients[..., : (degree + 1) ** 2 - 1, :])
 
 
 # ------------------------------------------------------------------------------------------------ programs of gsplat's
