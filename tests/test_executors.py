@@ -269,6 +269,19 @@ def test_no_worker_outlives_its_program_and_no_temporary_file_one_that_can_answe
     assert killed.with_suffix(".err").read_text() == ""  # Python's resource tracker warns of what it removes
 
 
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this system has no timer")
+def test_a_program_that_ends_does_not_wait_for_its_workers():
+    before = signal.signal(signal.SIGALRM, lambda *_: sys.exit(3))
+    started = time.monotonic()
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
+        with pytest.raises(SystemExit, match="3"):
+            list(Processes(1).map(time.sleep, [15]))
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - started < 10
+
+
 @pytest.mark.parametrize(
     "error",
     [

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.system.contracts import Range, check_fields, contract
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, one
 
 Projection = Literal["pinhole", "equidistant", "equisolid", "equirect", "ortho"]
 Angle = Annotated[float, Range(above=0, most=180)]  # degrees
@@ -54,7 +54,7 @@ class Lens:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.distorts and self.projection not in ("pinhole", "equidistant"):
-            raise UsageError("lens", f"a {self.projection} projection has no distortion")
+            raise UsageError("lens", f"{one(self.projection)} projection has no distortion")
 
     @property
     def distorts(self) -> bool:

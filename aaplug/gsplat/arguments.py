@@ -151,7 +151,7 @@ def refuse(others: Mapping[str, object]) -> None:
         if name in WITHOUT_EFFECT:
             continue
         if name not in FIXED:
-            raise UsageError(name, "is not an argument of gsplat's rasterization that aaplug knows")
+            raise UsageError(name, "is not an argument of this function of gsplat's that aaplug knows")
         default = FIXED[name]
         if isinstance(value, Tensor):
             same = name.endswith("_coeffs") and not value.any()

@@ -20,7 +20,7 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, one
 
 F = TypeVar("F", bound=Callable[..., Any])
 Sizes = dict[Any, Any]  # of the dimensions that a call has named so far
@@ -147,11 +147,11 @@ def described(value: Any) -> str:
             kind = f"{layout.removeprefix('torch.')} "
         return f"{kind}{str(value.dtype).removeprefix('torch.')} {list(value.shape)}{where}"
     if isinstance(value, list | tuple) and not all(isinstance(item, SHOWN_TYPES) for item in value):
-        return f"a {type(value).__name__} of {', '.join(dict.fromkeys(map(described, value)))}"
+        return f"{one(type(value).__name__)} of {', '.join(dict.fromkeys(map(described, value)))}"
     if isinstance(value, SHOWN_TYPES):
         text = repr(value)
         return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[:MAX_VALUE_CHARACTERS]}..."
-    return f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+    return f"the class {value.__name__}" if isinstance(value, type) else one(type(value).__name__)
 
 
 def _term(hint: Any) -> Term:
@@ -188,7 +188,7 @@ def _term(hint: Any) -> Term:
         return Term(lambda value, _: callable(value), "a function")
     if not isinstance(kind, type) or kind in (Any, object, type):
         return ANYTHING
-    words = WORDS.get(kind, f"a {kind.__name__}")
+    words = WORDS.get(kind, one(kind.__name__))
     return Term(lambda value, _: isinstance(value, kind) and not isinstance(value, type), words)
 
 

@@ -14,6 +14,7 @@ from types import FrameType
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
+VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
 GONE = {  # options, verbs and functions of version 0.2, in CHANGELOG.md too; each with what takes its place
     "densify_every": "`method` mipmap-gs",
@@ -70,6 +71,11 @@ def listing(names: Sequence[str], most: int = 6) -> str:
     """Join names for a message, cut short where there are many."""
     first = ", ".join(names[:most])
     return first if len(names) <= most else f"{first} and {len(names) - most} more"
+
+
+def one(noun: str) -> str:
+    """A noun with its article."""
+    return f"a{'n' * noun.lower().startswith(VOWELS)} {noun}"
 
 
 def counted(number: int, noun: str) -> str:

@@ -102,7 +102,7 @@ class Processes:
             try:
                 most = ITEMS_PER_WORKER * self.workers
                 yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
-            except (KeyboardInterrupt, GeneratorExit):  # the items at work need not be finished
+            except (KeyboardInterrupt, GeneratorExit, SystemExit):  # the items at work need not be finished
                 for process in getattr(pool, "_processes", None) or {}:
                     with suppress(OSError):
                         os.kill(process, signal.SIGTERM)

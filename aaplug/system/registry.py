@@ -20,7 +20,7 @@ from threading import get_ident
 from typing import Any, TypeVar
 
 from aaplug.system.contracts import contract, described
-from aaplug.system.errors import UsageError, did_you_mean, failure, not_one_of
+from aaplug.system.errors import UsageError, did_you_mean, failure, not_one_of, one
 
 PREFIX = "aaplug."
 REGISTRIES = {  # place of each kind's registry; a kind's plural, with underscores, is an entry point group
@@ -125,7 +125,7 @@ class Registry(Mapping[str, T]):
         self._load_plug_ins()
         where = f"{self.kind} {name}"
         if name in self._built_in or name in self._entries:
-            raise UsageError(where, f"a {self.kind} named '{name}' exists already")
+            raise UsageError(where, f"{one(self.kind)} named '{name}' exists already")
         self._add(name, value, where)
 
     def _load_plug_ins(self) -> None:
@@ -148,7 +148,7 @@ class Registry(Mapping[str, T]):
                 if point.dist and point.dist.name == "aaplug" and find_spec(point.module.rpartition(".")[0]) is None:
                     continue  # the folder for comparisons may be deleted
                 if point.name in self._built_in:
-                    raise UsageError(where, f"a {self.kind} named '{point.name}' exists already")
+                    raise UsageError(where, f"{one(self.kind)} named '{point.name}' exists already")
                 try:
                     value = point.load()
                 except (Exception, SystemExit) as error:  # a plug-in can fail in any way
@@ -159,9 +159,9 @@ class Registry(Mapping[str, T]):
 
     def _add(self, name: str, value: T, where: str) -> None:
         if self._entries.get(name, value) is not value:  # it is itself where another thread was first
-            raise UsageError(where, f"a {self.kind} named '{name}' exists already")
+            raise UsageError(where, f"{one(self.kind)} named '{name}' exists already")
         if isinstance(value, type) or not isinstance(value, self.type):
-            noun = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+            noun = f"the class {value.__name__}" if isinstance(value, type) else one(type(value).__name__)
             raise UsageError(where, f"is {noun}, which is not a {self.kind}; see `aaplug guide contributing`")
         name_inside = getattr(value, "name", name)
         if name_inside != name:

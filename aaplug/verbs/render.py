@@ -14,7 +14,7 @@ from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import counted
+from aaplug.system.errors import counted, one
 from aaplug.verbs.verb import writes
 from aaplug.verbs.views import drawn, image_paths, names_image, storage_of
 
@@ -71,8 +71,9 @@ def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     exposed = any(view.exposure for view in views)
     mean = f", mean of {' or '.join(map(str, counts))} frames" * exposed
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
-    kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
+    name = renderer.training.convention.name
+    kind = one(f"{name} scene{' of 2D Gaussians' * renderer.scene.flat}")
     return (
-        f"recipe: {renderer.recipe.name} for a {kind}, {counted(len(views), 'view')} at {sizes_of(views)}, "
+        f"recipe: {renderer.recipe.name} for {kind}, {counted(len(views), 'view')} at {sizes_of(views)}, "
         f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel{mean}"
     )
