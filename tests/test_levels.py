@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from threading import get_ident
 
@@ -20,10 +21,10 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
 from aaplug.levels import pairing
-from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
-from aaplug.levels.covariances import area, areas, covariances
+from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, pair_moments, rates_of
+from aaplug.levels.covariances import area, areas, blur, covariances, overlaps
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
-from aaplug.levels.pairing import MAX_COST, costs, edges_below, matching
+from aaplug.levels.pairing import ALPHA_WEIGHT, MAX_COST, PIXEL_BLUR, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.rendering.assumed import cameras_around
@@ -92,6 +93,36 @@ def test_counts_are_met_exactly():
     scene = make_scene(120)
     assert [len(merged_to(count, scene)) for count in (1, 30, 119)] == [1, 30, 119]
     assert merged_to(120, scene) is scene
+
+
+def test_costs_are_those_of_the_overlaps_of_both_gaussians_and_the_merged_one():
+    scene = make_scene(40, dtype=torch.float64)
+    clusters = clusters_of(scene, torch.linspace(10, 30, 40))
+    one, other = torch.arange(39), torch.arange(1, 40)
+    a, b = clusters[one], clusters[other]
+    _, share, covs = pair_moments(a, b)
+    px2 = (a.rates * 0.5).square()
+    middle = a.means + (1 - share)[:, None] * (b.means - a.means)
+    alpha = torch.full((39, 1), ALPHA_WEIGHT**0.5, dtype=torch.float64)
+    first, second = (c.weights[:, None] * torch.cat([c.colours, alpha], dim=1) for c in (a, b))
+    parts = [(a.means, a.covs, first), (b.means, b.covs, second), (middle, covs, -first - second)]
+    expected = torch.zeros(39, dtype=torch.float64)
+    for (m, u, light), (n, v, by) in product(parts, parts):
+        through = overlaps(blur(u + v, 2 * PIXEL_BLUR / px2), n - m).mean(dim=1)
+        expected += (light * by).sum(dim=1) * through * px2
+    torch.testing.assert_close(costs(clusters, one, other, 0.5), expected)
+    cheap = expected <= expected.median()
+    found = costs(clusters, one, other, 0.5, expected.median().item())
+    torch.testing.assert_close(found[cheap], expected[cheap])
+    assert (found[~cheap] > expected.median()).all()
+
+
+def test_neighbours_along_several_curves_are_compared_once():
+    clusters = clusters_of(make_scene(300), torch.full((300,), RATE))
+    fresh = torch.arange(300) % 7 == 0
+    for edges in (edges_below(clusters, 1.0, math.inf), edges_below(clusters, 1.0, math.inf, 0.0, fresh)):
+        assert (edges.one < edges.other).all()
+        assert len((300 * edges.one + edges.other).unique()) == len(edges)
 
 
 def test_equal_gaussians_are_merged_too():
@@ -187,7 +218,11 @@ def test_thin_things_keep_their_contrast(level, least, blind, monkeypatch):
     look, rates = Renderer.of(scene, cameras, "matched"), rates_of(scene, cameras.train)
     found = merge(scene, rates, Goal.of_level(level))
     assert least < contrast(look.showing(found), look, cameras.test, 2**level) < 1.1
-    monkeypatch.setattr(pairing, "costs", lambda a, b, rate, most: (b.means - a.means).square().sum(dim=1).float())
+
+    def distances(clusters, one, other, rate, most):
+        return (clusters.means[other] - clusters.means[one]).square().sum(dim=1).float()
+
+    monkeypatch.setattr(pairing, "costs", distances)
     nearest = merge(scene, rates, Goal(0.5**level, len(found)))
     assert contrast(look.showing(nearest), look, cameras.test, 2**level) < blind
 
@@ -219,7 +254,7 @@ def test_extreme_sizes_and_transparent_gaussians_are_merged():
     assert len(found) == 9
     assert all(column.isfinite().all() for column in found.columns.values())
     clusters = clusters_of(scene, torch.full((60,), RATE))
-    assert (costs(clusters[:-1], clusters[1:], 1.0) <= MAX_COST).all()
+    assert (costs(clusters, torch.arange(59), torch.arange(1, 60), 1.0) <= MAX_COST).all()
 
 
 def test_rotations_become_quaternions_again():

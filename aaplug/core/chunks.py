@@ -16,7 +16,7 @@ SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
 
 def chunks_of(means: Float[Tensor, "n 3"], largest: int = MAX_CHUNK_GAUSSIANS) -> Int[Tensor, " n"]:
     """The chunk of each Gaussian, numbered along the curve; none has more than `largest` unless they coincide."""
-    codes, order = torch.sort(curve(means.double()), stable=True)
+    codes, order = torch.sort(curve(squeezed(means.double())), stable=True)
     first = torch.ones(len(codes), dtype=torch.bool)  # whether a chunk begins at a place
     if len(codes):
         first[1:] = False
@@ -32,12 +32,17 @@ def chunks_of(means: Float[Tensor, "n 3"], largest: int = MAX_CHUNK_GAUSSIANS) -
     return numbers
 
 
-def curve(means: Float[Tensor, "n 3"], shift: float = 0.0) -> Int[Tensor, " n"]:
-    """Place of each mean along a Morton curve (Morton 1966) through space, which is squeezed far from the middle."""
+def squeezed(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Each mean in space that is squeezed far from the middle, to lie between -1 and 1."""
     offsets = means - means.median(dim=0).values
     size = offsets.abs().median().clamp(min=torch.finfo(means.dtype).tiny)
-    squeezed = offsets / (size + offsets.abs())  # between -1 and 1
-    cells = ((0.25 * (squeezed + 1) + shift) * (2**BITS - 1)).long()
+    return offsets / (size + offsets.abs())
+
+
+def curve(places: Float[Tensor, "n 3"], shift: float = 0.0) -> Int[Tensor, " n"]:
+    """Order of places in squeezed space along a Morton curve (Morton 1966)."""
+    cells = ((0.25 * (places + 1) + shift) * (2**BITS - 1)).long()
     for by, mask in SPREADS:
-        cells = (cells | (cells << by)) & mask
+        cells |= cells << by
+        cells &= mask
     return cells[:, 0] | cells[:, 1] << 1 | cells[:, 2] << 2

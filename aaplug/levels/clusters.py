@@ -118,7 +118,8 @@ def clusters_of(
     colours = scene.base_colours
     labels = torch.arange(len(scene))
     chunks = torch.zeros_like(labels) if chunks is None else chunks
-    return Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, labels)
+    each = Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, labels)
+    return each[labels]  # with each component apart in memory
 
 
 def merge_pairs(a: Clusters, b: Clusters) -> Clusters:

@@ -5,7 +5,7 @@ Gaussian is a 2D one whose covariance is a minor of the packed one, so every int
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
@@ -71,16 +71,10 @@ def overlaps(total: Packed, offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3
 
     total: the sum of their covariances.  offsets: between their means.
     """
-    minors = zip(PLANES, _minors(total), strict=True)
-    return torch.stack([overlap(minor, (offsets[:, i], offsets[:, j])) for (i, j), minor in minors], dim=1)
-
-
-def overlap(total: Sequence[Tensor], offset: Sequence[Tensor] | None = None) -> Float[Tensor, " n"]:
-    """`overlaps` in one plane, of covariances (xx, xy, yy) and offsets (x, y); no offsets are none."""
-    a, b, c = total
-    det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
-    peak = det.rsqrt() / (2 * math.pi)
-    if offset is None:
-        return peak
-    x, y = offset
-    return peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
+    found = list[Tensor]()
+    for (i, j), (a, b, c) in zip(PLANES, _minors(total), strict=True):
+        x, y = offsets[:, i], offsets[:, j]
+        det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
+        power = -0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det
+        found.append(det.rsqrt() / (2 * math.pi) * torch.exp(power))
+    return torch.stack(found, dim=1)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from aaplug.core.chunks import curve
+from aaplug.core.chunks import curve, squeezed
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.levels.clusters import Clusters, clusters_of, gaussians_of, merge_pairs
 from aaplug.levels.covariances import areas, blur, covariances
@@ -164,8 +164,8 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
                 clusters, places = _merge_matching(clusters, pairs)
                 fresh = torch.zeros(len(clusters), dtype=torch.bool)
                 fresh[places[pairs.one]] = True
-                edges = Edges(places[edges.one], places[edges.other], edges.cost)
-                edges = edges[~(fresh[edges.one] | fresh[edges.other])]
+                one, other = places.index_select(0, edges.one), places.index_select(0, edges.other)
+                edges = Edges(one, other, edges.cost)[~(fresh.index_select(0, one) | fresh.index_select(0, other))]
                 edges = Edges.joined([edges, edges_below(clusters, goal.rate, ceiling, goal.smallest, fresh)])
                 tell(first - len(clusters))
             if is_last:
@@ -192,7 +192,7 @@ def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     """
     order = torch.arange(len(scene))
     shape = [scene.logit_opacities, *scene.log_scales.unbind(dim=1), *scene.sh[:, 0].unbind(dim=1)]
-    for key in (*shape, *scene.means.unbind(dim=1), curve(scene.means.double()), chunks):
+    for key in (*shape, *scene.means.unbind(dim=1), curve(squeezed(scene.means.double())), chunks):
         order = order[torch.argsort(key[order], stable=True)]
     return order
 

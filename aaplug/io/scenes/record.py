@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.chunks import curve
+from aaplug.core.chunks import curve, squeezed
 from aaplug.core.conventions import CLASSIC, CONVENTIONS, Convention
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.io.values import Entry, Place, text
@@ -79,7 +79,7 @@ def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat
     scene = joined([holdable(path, part, format, degree, flat) for part in parts])
     if not len(scene):
         raise OutputError(path, f"a .{format} cannot hold a scene without Gaussians; write a .ply")
-    return scene[curve(scene.means.double()).argsort(stable=True)]
+    return scene[curve(squeezed(scene.means.double())).argsort(stable=True)]
 
 
 def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Float[Tensor, "_ 3"]]]) -> None:
