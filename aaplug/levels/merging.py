@@ -5,7 +5,7 @@ the scene's order nor on the number of threads.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import NamedTuple
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from aaplug.core.chunks import curve, squeezed
 from aaplug.core.gaussians import Fusion, Gaussians, joined
@@ -131,9 +132,9 @@ def merge_in_chunks(
             gone[ends[0]] = done
             tell(min(sum(gone.values()), total), total)
 
-        batch = order[slice(*ends)]
-        clusters = clusters_of(scene[batch], rates[batch], chunks[batch], visible[batch])
-        return _merge_batch(clusters, scene[batch], goal, tell_batch)
+        places = order[slice(*ends)]
+        batch = scene[places]
+        return _merge_batch(clusters_of(batch, rates[places], chunks[places], visible[places]), batch, goal, tell_batch)
 
     workers = min(given_threads(), len(stops) - 1)
     parts = [*(Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))]
@@ -190,10 +191,18 @@ def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
 
     So the scene's own order plays no part.
     """
-    order = torch.arange(len(scene))
+
+    def ordered(rows: Int[Tensor, " r"], keys: Sequence[Tensor]) -> Int[Tensor, " r"]:
+        for key in keys:
+            rows = rows[torch.argsort(key[rows], stable=True)]
+        return rows
+
+    keys = curve(squeezed(scene.means.double())), chunks
+    order = ordered(torch.arange(len(scene)), keys)
+    same = torch.stack([key[order].diff() == 0 for key in keys]).all(dim=0)
+    tied = pad(same, (1, 0)) | pad(same, (0, 1))
     shape = [scene.logit_opacities, *scene.log_scales.unbind(dim=1), *scene.sh[:, 0].unbind(dim=1)]
-    for key in (*shape, *scene.means.unbind(dim=1), curve(squeezed(scene.means.double())), chunks):
-        order = order[torch.argsort(key[order], stable=True)]
+    order[tied] = ordered(order[tied], (*shape, *scene.means.unbind(dim=1), *keys))
     return order
 
 
