@@ -877,7 +877,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "viewmats_rs: only None is supported": {"viewmats_rs": torch.zeros(2, 4, 4)},
     "colors: expected colours for render_mode RGB, got None": {"colors": None},
     "masks: expected shape [2, 28, 40], got [2, 4, 5]": {"masks": torch.ones(2, 4, 5, dtype=torch.bool)},
-    "heliocentric: is not an argument of gsplat's rasterization": {"heliocentric": 1},
+    "heliocentric: is not an argument of this function of gsplat's": {"heliocentric": 1},
     "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
 }
 
