@@ -9,10 +9,13 @@ import re
 import shutil
 import sys
 import tempfile
+import threading
+import time
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 import torch
@@ -196,13 +199,66 @@ def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, 
 @linux
 def test_a_library_that_ended_a_process_is_left_aside(copied_cache, monkeypatch, caplog):
     kernel = binning.PAIRS
-    compiled.package_path(kernel).with_suffix(".so.sha256").unlink(missing_ok=True)
-    monkeypatch.setattr(compiled, "_opened", lambda library: os._exit(9))
-    if not (child := os.fork()):
-        compiled.package_of(kernel)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
-    assert compiled.package_of(kernel) is None
-    assert "a process that loaded it died; images are drawn eagerly" in caplog.text
+    mark = compiled.package_path(kernel).with_suffix(".so.sha256")
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled, "_opened", lambda library: os._exit(9))
+        if not (child := os.fork()):
+            try:
+                compiled.package_of(kernel)
+            finally:
+                os._exit(0)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+        assert compiled.package_of(kernel) is None
+    said = f"a process that loaded it died; if it was killed, delete {mark}; images are drawn eagerly"
+    assert said in caplog.text
+    monkeypatch.setattr(compiled, "lock", lambda descriptor, wait=False: None)
+    assert compiled.package_of(kernel) is not None  # where nothing locks, that process may be alive
+
+
+@linux
+def test_a_library_is_not_compared_again_after_waiting_for_another_process(copied_cache, monkeypatch):
+    kernel, close, compared, others = binning.PAIRS, compiled._close, list[int](), list[threading.Thread]()
+
+    def slow(result: torch.Tensor, expected: torch.Tensor) -> bool:
+        compared.append(threading.get_ident())
+        if not others:
+            others.append(threading.Thread(target=compiled.package_of, args=[kernel]))
+            others[0].start()
+            time.sleep(0.1)
+        return close(result, expected)
+
+    monkeypatch.setattr(compiled, "_close", slow)
+    assert compiled.package_of(kernel) is not None
+    others[0].join()
+    assert {*compared} == {threading.get_ident()}
+
+
+def test_a_kernel_that_ends_a_process_is_built_last_next_time(empty_cache, monkeypatch):
+    built, deadly = list[str](), compiled.KERNELS[3]
+    mark = compiled.package_path(deadly).with_suffix(".so.sha256")
+    mark.parent.mkdir()
+
+    def dies(*_: object) -> NoReturn:
+        raise UsageError("worker process", "died")
+
+    def builds(pool: object, work: object, packages: Sequence[tuple[str, None]]) -> Iterator[object]:
+        for name, target in packages:
+            if name == deadly.name:
+                mark.write_text(f"{compiled.TRIED}hash")
+                dies()
+            built.append(name)
+            yield (name, target), ""
+
+    monkeypatch.setattr(compiled.Processes, "map", builds)
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    for _ in range(2):
+        built.clear()
+        with pytest.raises(UsageError, match=f"cannot compile {deadly.name} here: a process that loaded it died$"):
+            compiled.build()
+    assert sorted([*built, deadly.name]) == sorted(kernel.name for kernel in compiled.kernels_of(()))
+    monkeypatch.setattr(compiled.Processes, "map", dies)
+    with pytest.raises(UsageError, match="worker process: died"):
+        compiled.build()
 
 
 DRAWS = """if True:

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -284,17 +284,19 @@ def _build_all(
 ) -> None:
     """Build what is missing or broken of these packages, in one process per thread of torch.
 
-    A kernel that torch cannot compile leaves no other unbuilt.
+    A kernel that torch cannot compile leaves no other unbuilt.  One that ends a process ends all, and is the last to be
+    built next time.
     """
     costs = [SLOW.get(kernel.name, 1) for kernel, _ in wanted]
-    paths = [package_path(kernel) if target is None else _path_in(folder, kernel, target) for kernel, target in wanted]
     left = {
         (kernel.name, target): cost
-        for (kernel, target), cost, path in zip(wanted, costs, paths, strict=True)
-        if not _is_sound(kernel, path)
+        for (kernel, target), cost in zip(wanted, costs, strict=True)
+        if not _is_sound(kernel, package_path(kernel) if target is None else _path_in(folder, kernel, target))
     }
+    paths = {(kernel.name, target): _path_in(folder, kernel, target) for kernel, target in wanted}
+    tried = _trials(paths)
     # the longest come first, so that none is left over at the end
-    left = dict(sorted(left.items(), key=lambda item: -item[1]))
+    left = dict(sorted(left.items(), key=lambda item: (item[0] in tried, -item[1])))
 
     def tell(at_work: int) -> None:
         rest = sum(left.values()) - sum([*left.values()][:at_work]) / 2  # they are half done
@@ -316,11 +318,10 @@ def _build_all(
                     if problem:
                         problems[package[0]] = problem
             except UsageError:  # a process died, perhaps of what it built
-                problems |= {
-                    kernel.name: DEADLY for (kernel, _), path in zip(wanted, paths, strict=True) if _is_deadly(path)
-                }
-                if not problems:
+                died = dict(_trials(paths).items() - tried.items())
+                if not died:
                     raise
+                problems |= {name: DEADLY for name, _ in died}
         if problems:
             names, problem = ", ".join(sorted(problems)), next(iter(problems.values()))
             raise UsageError("warmup", f"torch {torch.__version__} cannot compile {names} here: {problem}")
@@ -346,9 +347,15 @@ def _library_and_mark(package: Path) -> tuple[Path, Path]:
     return cache_folder() / f"{package.stem}.so", cache_folder() / f"{package.stem}.so.sha256"
 
 
-def _is_deadly(package: Path) -> bool:
-    mark = _library_and_mark(package)[1]
-    return mark.is_file() and mark.read_text().startswith(TRIED)
+def _trials(paths: Mapping[tuple[str, Target | None], Path]) -> dict[tuple[str, Target | None], int]:
+    """Those packages whose trial has not ended, or ended with its process, and when it began, in ns."""
+    begun = {}
+    for package, path in paths.items():
+        _, mark = _library_and_mark(path)
+        with suppress(OSError, UnicodeError):  # there is none
+            if mark.read_text().startswith(TRIED):
+                begun[package] = mark.stat().st_mtime_ns
+    return begun
 
 
 def _is_sound(kernel: Kernel, package: Path) -> bool:
@@ -372,13 +379,14 @@ def _compared(kernel: Kernel, package: Path) -> Run:
             (folder / library.name).write_bytes(members.read(name))
             digest = digest_of_files([folder / library.name])
             os.replace(folder / library.name, library)
-        with _trial(mark, digest), torch.no_grad(), torch_threads(1):  # several threads would wait for each other
+        with _trial(mark, digest) as first, torch.no_grad(), torch_threads(1):  # more threads would wait for each other
             run = _opened(library)
-            args, twins = kernel.example(), kernel.example()
-            results = [*run(list(args)), *args]  # with the arguments that are updated in place
-            expected = [*kernel.function(*twins), *twins]
-            if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
-                raise ValueError("its results differ from those of eager code")
+            if first:
+                args, twins = kernel.example(), kernel.example()
+                results = [*run(list(args)), *args]  # with the arguments that are updated in place
+                expected = [*kernel.function(*twins), *twins]
+                if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
+                    raise ValueError("its results differ from those of eager code")
         return run
     except Exception as error:  # a broken library can fail in any way
         [problem, *_] = reason(error).splitlines() or [type(error).__name__]
@@ -386,21 +394,27 @@ def _compared(kernel: Kernel, package: Path) -> Run:
 
 
 @contextmanager
-def _trial(mark: Path, digest: str) -> Iterator[None]:
-    """Mark a library as tried for the time of the block, then as sound.
+def _trial(mark: Path, digest: str) -> Iterator[bool]:
+    """Mark a library as tried for the time of the block, then as sound; false if another process did so meanwhile.
 
-    Raises ValueError if a process died inside the block: loading the library would end this one, too.
+    Raises ValueError if a process died inside the block: loading the library would end this one, too.  Where nothing
+    locks, that process may be alive, and the library is tried again.
     """
     with open(mark, "a+", encoding="ascii") as file:
-        lock(file.fileno(), wait=True)  # another process may be trying it
+        waits = lock(file.fileno()) is False  # another process is trying it
+        locked = lock(file.fileno(), wait=True)
         file.seek(0)
-        if file.read() == TRIED + digest:
-            raise ValueError(DEADLY)
+        known = file.read()
+        if waits and known == digest:
+            yield False
+            return
+        if locked and known == TRIED + digest:
+            raise ValueError(f"{DEADLY}; if it was killed, delete {mark}")
         file.truncate(0)
         print(TRIED + digest, end="", file=file, flush=True)
         outcome = ""
         try:
-            yield
+            yield True
             outcome = digest
         finally:
             file.truncate(0)
