@@ -31,4 +31,4 @@ def spherical_harmonics(
         raise UsageError("degrees_to_use", f"{degrees_to_use} needs {count} coefficients, coeffs has {given}")
     directions = functional.normalize(dirs.reshape(-1, 3), dim=1)
     sums = (sh_colour(coeffs[..., :count, :].reshape(-1, count, 3), directions) - COLOUR_OFFSET).view_as(dirs)
-    return sums if masks is None else sums * masks[..., None]
+    return sums if masks is None else sums.where(masks[..., None], 0.0)

@@ -229,7 +229,8 @@ def colour_of(text: str, where: str = "background") -> Colour:
     Raises:
         UsageError: CSS knows no such colour; the error is at `where`.
     """
-    listed = re.sub(r"(?<=[\d%])\s+(?=\d)", ",", text)  # Pillow knows CSS's commas, not its spaces
+    # Pillow knows CSS's commas, not its spaces
+    listed = text if "," in text else re.sub(r"(?<=[\d%])\s+(?=\d)", ",", text)
     try:
         red, green, blue = (min(max(level, 0), 255) / 255 for level in ImageColor.getrgb(listed))
     except ValueError as error:
