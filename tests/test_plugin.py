@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+from argparse import ArgumentParser
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -338,9 +339,10 @@ def test_a_plug_in_that_fails_in_a_verb_is_named(case, monkeypatch, tmp_path):
         assert isinstance(caught.value.__cause__, KeyError)
 
 
-def test_a_worker_that_is_told_to_end_inside_a_plug_in_ends(monkeypatch, tmp_path):
+@pytest.mark.parametrize("handler", [_exit, lambda *_: ArgumentParser().exit(143)], ids=["worker", "program"])
+def test_a_program_that_a_signal_ends_inside_a_plug_in_ends(handler, monkeypatch, tmp_path):
     with pytest.raises(SystemExit, match="143"):
-        evaluated(lambda *_: _exit(signal.SIGTERM, None), monkeypatch, tmp_path)
+        evaluated(lambda *_: handler(signal.SIGTERM, None), monkeypatch, tmp_path)
 
 
 def test_a_camera_format_that_fails_after_another_read_the_folder_is_named(monkeypatch):

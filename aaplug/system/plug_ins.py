@@ -3,7 +3,7 @@
 aaplug's own objects are called as they are.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from functools import cache, partial
@@ -87,7 +87,7 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
     try:
         yield [*theirs]
     except (Exception, SystemExit) as error:
-        if not theirs or is_lack_of_memory(error) or _is_worded(error):
+        if not theirs or is_lack_of_memory(error) or _is_worded(error, theirs.values()):
             raise
         places = {where: place_in(error, package) for where, package in theirs.items()}
         where = max(places, key=lambda each: places[each])
@@ -97,17 +97,17 @@ def blaming(*parts: tuple[str, object], file: Path | None = None, code: object =
         raise PlugInError(where, f"fails{on} with {failure(error, theirs[where])}") from error
 
 
-def _is_worded(error: BaseException) -> bool:
+def _is_worded(error: BaseException, packages: Collection[str]) -> bool:
     """True if an error says all: it names a plug-in or a file, or is a plug-in's own words for the user.
 
-    So does the end of a process that aaplug itself ends.
+    So does the end of a program that no plug-in's code asks for, but, say, a signal's handler.
     """
     if isinstance(error, PlugInError):
         return True
     *_, (last, _) = walk_tb(error.__traceback__)
-    if top_package(last) == OURS:
-        return isinstance(error, SystemExit) or (isinstance(error, AaplugError) and type(error) is not UsageError)
-    return isinstance(error, AaplugError)
+    if isinstance(error, SystemExit):
+        return top_package(last) not in packages
+    return isinstance(error, AaplugError) and (type(error) is not UsageError or top_package(last) != OURS)
 
 
 def package_of(value: Any) -> str:
