@@ -13,8 +13,8 @@ from traceback import walk_tb
 from types import FrameType
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
-# In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
+# In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
 GONE = {  # options, verbs and functions of version 0.2, in CHANGELOG.md too; each with what takes its place
     "densify_every": "`method` mipmap-gs",
