@@ -51,8 +51,10 @@ def built() -> CompiledKernels:
 
 @pytest.fixture
 def empty_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path))
-    return tmp_path
+    folder = tmp_path / "Caches"
+    folder.mkdir()
+    monkeypatch.setattr(compiled.platformdirs, "user_cache_dir", lambda *_, **__: str(folder))
+    return folder
 
 
 # also those that `warmup` compiles on request, and those of trainers

@@ -388,6 +388,8 @@ def _compared(kernel: Kernel, package: Path) -> Run:
                 if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
                     raise ValueError("its results differ from those of eager code")
         return run
+    except UsageError:
+        raise
     except Exception as error:  # a broken library can fail in any way
         [problem, *_] = reason(error).splitlines() or [type(error).__name__]
         raise UsageError(f"kernel {kernel.name}", f"cannot be used: {problem}") from error
@@ -397,7 +399,7 @@ def _compared(kernel: Kernel, package: Path) -> Run:
 def _trial(mark: Path, digest: str) -> Iterator[bool]:
     """Mark a library as tried for the time of the block, then as sound; false if another process did so meanwhile.
 
-    Raises ValueError if a process died inside the block: loading the library would end this one, too.  Where nothing
+    Raises UsageError if a process died inside the block: loading the library would end this one, too.  Where nothing
     locks, that process may be alive, and the library is tried again.
     """
     with open(mark, "a+", encoding="ascii") as file:
@@ -409,7 +411,7 @@ def _trial(mark: Path, digest: str) -> Iterator[bool]:
             yield False
             return
         if locked and known == TRIED + digest:
-            raise ValueError(f"{DEADLY}; if it was killed, delete {mark}")
+            raise UsageError("kernel", f"cannot be used: {DEADLY}; if it was killed, delete {mark}")
         file.truncate(0)
         print(TRIED + digest, end="", file=file, flush=True)
         outcome = ""
