@@ -170,13 +170,20 @@ def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(monkeypa
 
 def test_a_loss_that_an_entry_point_names_is_tried(monkeypatch):
     module = ModuleType("losses")
-    vars(module).update(sum=lambda image, truth: (image - truth).square().sum(), mean=lambda image, truth: image.mean())
-    points = [EntryPoint(name, f"losses:{name}", "aaplug.losses") for name in ("sum", "mean")]
+    filters = torch.rand(4, 3, 32, 32)  # as a network has them: float32, and larger than some images
+    losses = {
+        "sum": lambda image, truth: (image - truth).square().sum(),
+        "perceptual": lambda image, truth: torch.conv2d((image - truth).permute(2, 0, 1), filters).square().mean(),
+        "mean": lambda image, truth: image.mean(),
+        "half": lambda image, truth: ((image - truth).detach() + image - truth).square().mean(),
+    }
+    vars(module).update(losses)
+    points = [EntryPoint(name, f"losses:{name}", "aaplug.losses") for name in losses]
     monkeypatch.setitem(sys.modules, "losses", module)
     monkeypatch.setattr("aaplug.verbs.check_plugin.entry_points", lambda group: points * (group == "aaplug.losses"))
     verdicts = {(name, law.partition(" ")[0]): problem for _, name, law, problem in check_plugin("losses")}
-    assert len(verdicts) == 2 * 2
-    assert [name for (name, _), problem in verdicts.items() if problem] == ["mean"]
+    assert len(verdicts) == 4 * 2
+    assert [name for (name, _), problem in verdicts.items() if problem] == ["mean", "half"]
 
 
 @dataclass(frozen=True)
