@@ -43,11 +43,9 @@ class Layout:
     @property
     def rows(self) -> Int[Tensor, " s"]:
         """Row of each splat."""
-        return (
-            torch.arange(len(self.sources), device=self.sources.device)
-            if self.packed
-            else self.images * self.gaussians + self.sources
-        )
+        if self.packed:
+            return torch.arange(len(self.sources), device=self.sources.device)
+        return self.images * self.gaussians + self.sources
 
     def column(self, values: Sequence[Tensor]) -> Tensor:
         """A column of the table, from the values of each image's splats."""
