@@ -53,7 +53,7 @@ class CameraOptions(Options):
     """The cameras."""
 
     cameras: Annotated[Path | None, flag("PATH", read=Path)] = None
-    """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's model folder)."""
+    """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's own)."""
     train_scale: Annotated[float | None, SCALE, CAMERAS] = None
     """Training size relative to the cameras' source size, where the files do not say."""
     images: Annotated[str | None, flag("FOLDER"), CAMERAS] = None
@@ -98,15 +98,19 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
 def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
     """Read the cameras and say where sizes and split come from; without any, the orbit that stands in for them."""
     how, orbit = words.keywords(CameraOptions), words.of(Orbit)
-    path = how.pop("cameras") or scene.camera_folder
+    named, own, orbits = how.pop("cameras"), scene.camera_path, "views" in words.values and orbit != Orbit()
+    path = named or (None if orbits else own)
     if path is None:
-        given, usual, problem = how, CameraOptions(), "is of cameras, and there are none; name them with `cameras`"
+        problem = "the views orbit" if own else "there are none; name them with `cameras`"
+        given, usual, problem = how, CameraOptions(), f"is of cameras, and {problem}"
     else:
         given, usual, problem = vars(orbit), Orbit(), f"is for scenes without cameras, and there are some: {path}"
     for name, value in given.items():
         if name != "monitor" and value != getattr(usual, name):
             raise UsageError(name, problem)
     if path is None:
+        if own:
+            say(f"cameras: those of {own} are not drawn, the views are around the scene")
         return orbit
     cameras = aaplug.read_cameras(path, **how)
     for note in cameras.notes:

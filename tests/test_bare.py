@@ -28,7 +28,7 @@ from aaplug.rendering.assumed import CROP_SIDE, cameras_around, decibels_at, fra
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
-from tests.conftest import make_scene
+from tests.conftest import make_scene, write_model
 
 UP = (0.0, 0.0, 1.0)
 SMALL = "--train-view 48x36"
@@ -274,6 +274,21 @@ def test_a_path_of_ones_own_keeps_its_field_of_view(cli, monkeypatch):
     monkeypatch.setattr(Renderer, "__call__", lambda self, camera: drawn.append(camera) or draw(self, camera))
     cli.done(f"video scene.ply -o new.webm --path path.json --resolution 40x60 {SMALL}")
     assert {camera.fy / camera.fx for camera in drawn} == {2.0}
+
+
+def test_an_orbit_around_a_scene_with_cameras_keeps_their_training(cli, dataset):
+    cameras = aaplug.read_cameras(dataset)
+    model = write_model(Path("model"), cameras.train, "eval=False", make_scene(60), 1)
+    _, err = cli.done(f"render {model} -o new --orbit 2 --recipe matched --resolution 40x30")
+    assert f"cameras: those of {model} are not drawn, the views are around the scene" in err
+    assert "training rate: assumed" not in err
+    assert [path.name for path in sorted(Path("new").iterdir())] == ["orbit_0.png", "orbit_1.png"]
+    own, orbited = aaplug.read_scene(model).cameras, around(aaplug.read_scene(model), Orbit(orbit=2))
+    assert own is not None
+    assert (orbited.train, orbited.assumed, orbited.files) == (own.train, False, own.files)
+    assert [view.trained_focal for view in orbited.test] == [None, None]
+    assert around(aaplug.read_scene(model), Orbit(train_rate=5.0)).assumed, "the user knows best"
+    cli.refused(f"render {model} -o one --orbit 2 --test-every 4", "--test-every: is of cameras, and the views orbit")
 
 
 def test_large_files_are_converted_in_parts_without_cameras(cli, monkeypatch):

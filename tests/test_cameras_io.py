@@ -10,23 +10,27 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import BLACK, WHITE
+from aaplug.core.conventions import CLASSIC, KHR
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.photos import without_suffix
 from aaplug.io.cameras.poses import inverse
 from aaplug.io.cameras.sets import CameraFileOptions
+from aaplug.io.scenes import write_scene
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
-from tests.conftest import make_camera
+from tests.conftest import make_camera, make_scene
 from tests.scene_files import write_json
 from tests.test_camera_paths import document
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
+TURNED = [0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]  # and moved, row by row
 
 
 def photo(path, width, height, mode="RGB"):
@@ -757,6 +761,55 @@ def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
     refused(write_json(tmp_path / "metadata.json", document), "metadata.json")
 
 
+# SHARP -----------------------------------------------------------------------------------------
+
+
+def sharp(folder, order="<", text=False, **tables):
+    """A scene with the tables of SHARP's camera, or with others instead."""
+    values = {"extrinsic": TURNED, "intrinsic": [300, 0, 21, 0, 310, 14, 0, 0, 1], "image_size": [40, 30]} | tables
+    write_scene(folder / "plain.ply", make_scene(9), overwrite=True)
+    elements = [PlyData.read(folder / "plain.ply")["vertex"]]
+    for name, column in values.items():
+        kind = "u4" if name == "image_size" else "f4"
+        elements.append(PlyElement.describe(np.array(column).astype([(name, kind)]), name))
+    PlyData(elements, text=text, byte_order=order).write(folder / "photo.ply")
+    return folder / "photo.ply"
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_the_camera_of_a_sharp_file_is_that_of_its_photograph(tmp_path, order):
+    path = sharp(tmp_path, order)
+    (camera,) = read_cameras(path).all
+    assert (camera.name, *values(camera), camera.hw) == ("photo", 300, 310, 21, 14, (30, 40))
+    assert (camera.cam_from_world.flatten().tolist(), camera.trained_focal) == (TURNED, camera.focal)
+    assert read_cameras(path, train_scale=0.5).all[0].hw == (15, 20)
+    scene = aaplug.read_scene(path)
+    assert (scene.convention, scene.cameras) == (KHR, read_cameras(path))
+    aaplug.write_scene(tmp_path / "again.ply", scene.gaussians())
+    assert aaplug.read_scene(tmp_path / "again.ply").cameras is not None
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "message"),
+    [
+        ("intrinsic", [300, 1, 21, 0, 310, 14, 0, 0, 1], "its camera: intrinsic should be [[fx 0 cx]"),
+        ("intrinsic", [-3, 0, 21, 0, 310, 14, 0, 0, 1], "intrinsic should be from 1e-06"),
+        ("intrinsic", [300, 0, math.nan, 0, 310, 14, 0, 0, 1], "intrinsic should be a finite number, not nan"),
+        ("image_size", [0, 30], "image_size should be a whole number of px"),
+        ("extrinsic", [2.0, *TURNED[1:]], "extrinsic should be a rotation"),
+        ("extrinsic", [*TURNED[:15], 2.0], "extrinsic's last row should be 0 0 0 1"),
+    ],
+)
+def test_an_odd_camera_of_a_sharp_file_is_refused(tmp_path, table, column, message):
+    refused(sharp(tmp_path, **{table: column}), "photo.ply: its camera", message)
+
+
+def test_tables_of_another_kind_are_no_camera(tmp_path):
+    for tables in ({"text": True}, {"intrinsic": [300, 310, 40, 30]}, {"image_size": [40, 30, 3]}):
+        scene = aaplug.read_scene(sharp(tmp_path, **tables))
+        assert (scene.convention, scene.cameras) == (CLASSIC, None)
+
+
 # Choosing ---------------------------------------------------------------------------------------
 
 
@@ -822,6 +875,7 @@ FIXTURES = {  # how to make each format's files, the path to read, and the file 
     "camera_path": (lambda folder: write_json(folder / "path.json", document()), ""),
     "llff": (llff, "poses_bounds.npy"),
     "multiscale": (lambda folder: multiscale(folder).parent, "metadata.json"),
+    "sharp": (sharp, ""),
 }
 
 

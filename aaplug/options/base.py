@@ -28,7 +28,7 @@ class Group:
 
 
 CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
-ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
+ORBIT = Group("orbit", "Views on an orbit around the scene and, without cameras, the training that is assumed.")
 LENS = Group("lens", "The lens to draw through, instead of that of the camera files.")
 FILES = Group("file", "Contents and format of image files.")
 DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")

@@ -218,7 +218,7 @@ class LensOptions(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Orbit(Options):
-    """Without cameras: views on an orbit around the scene, and the training that is assumed."""
+    """Views on an orbit around the scene and, without cameras, the training that is assumed."""
 
     orbit: Annotated[int | None, number(1, 10_000, whole=True), ORBIT] = None
     """Number of views around the scene (default: 8, or 1 for a single picture)."""

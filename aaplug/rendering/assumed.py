@@ -42,24 +42,31 @@ TRAINING_RATE = "training rate: "  # how the note begins
 
 @contract
 def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> CameraSet:
-    """Cameras for a scene without any: the assumed training views, and as test views those that an orbit shows.
+    """The scene's own training views, or else assumed ones, and as test views those that an orbit shows.
 
     single: show one view, unless the orbit says how many.
 
     Raises:
         UsageError: the scene is empty, or a direction is none.
+        FormatError: the scene's own cameras cannot be read.
     """
     if single and orbit.orbit is None and orbit.eye is None:
         orbit = replace(orbit, orbit=1)
     scene = scene_of(scene)
     sample = scene.sample(PROBE_ROWS)
     frame = frame_around(scene, orbit, sample)
-    path = scene.source
+    path, up = (
+        scene.source,
+        f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})",
+    )
+    if orbit.train_view is orbit.train_rate is None and (own := scene.cameras) is not None:
+        free = replace(own.train[0], trained_focal=None)
+        return replace(own, test=_orbit_views(orbit, frame, free), notes=(*own.notes, up))
     train, reason = _assumed_training(orbit, frame, sample, path)
     cameras = CameraSet(train, _orbit_views(orbit, frame, train[0]), assumed=True)
     size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)
     note = f"{TRAINING_RATE}assumed as of {size} px from the orbit, {rate:.4g} px per unit in its middle ({reason})"
-    notes = (note, f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})")
+    notes = (note, up)
     if path is not None and recognized(path.parent):
         notes = (*notes, f"there are cameras: --cameras {path.parent}")
     return replace(cameras, notes=notes)
@@ -119,7 +126,7 @@ def _assumed_training(
 
 
 def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, ...]:
-    """The views to show, as poses of the data set where they are like the training views."""
+    """The views to show, of a training view's size; poses of the data set where it is one and they are like it."""
     size = trained.width, trained.height
     fov = math.radians(orbit.fov)
     centre = frame.centre if orbit.look_at is None else frame.centre.new_tensor(orbit.look_at)
@@ -133,7 +140,7 @@ def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, .
         return (centred("eye", size, min(size) / 2 / math.tan(fov / 2), look_at(eye, centre, up)),)
     elevation = math.radians(ELEVATION if orbit.elevation is None else orbit.elevation)
     views = orbit_views(replace(frame, centre=centre), orbit.orbit or ORBIT_VIEWS, size, elevation, fov)
-    if orbit.look_at is not None or orbit.fov != DEFAULT_FOV:
+    if trained.trained_focal is None or orbit.look_at is not None or orbit.fov != DEFAULT_FOV:
         return views
     return tuple(replace(view, fx=trained.fx, fy=trained.fy).as_trained() for view in views)
 

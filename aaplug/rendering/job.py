@@ -62,7 +62,7 @@ class Job(Generic[O_co]):
     def of(cls, scene: SceneLike, cameras: CamerasLike, options: O, single: bool = False) -> "Job[O]":
         """Open the scene and its cameras; raises AaplugError.
 
-        cameras: None for those of the scene's model folder, else an `Orbit`.  single: it is asked for one picture.
+        cameras: None for the scene's own, else an `Orbit`.  single: it is asked for one picture.
         """
         opened = scene_of(scene, still=not isinstance(options, IN_TIME))
         if cameras is None:

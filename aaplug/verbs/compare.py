@@ -44,7 +44,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
 
     Args:
         scenes: two or more, each as `render` takes it; or by the names that the results give them.
-        cameras: see `render`; None for the cameras of the first scene's model folder, or an orbit around it.
+        cameras: see `render`; None for the first scene's own, or an orbit around it.
         output: folder for compare.json, compare.csv, report.html and contact-sheet.png; None writes nothing.
 
     Raises:

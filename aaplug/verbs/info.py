@@ -38,8 +38,8 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
 
     Args:
         scene: see `render`.
-        cameras: training cameras, their file or folder, to tell also how finely they sample the scene; None for those
-            of its model folder.  Where it has none, or for an `Orbit`: what can be told without, under its assumption.
+        cameras: training cameras, their file or folder, to tell also how finely they sample the scene; None for
+            its own.  Where it has none: what can be told without, under the assumption of an `Orbit`.
 
     Returns:
         JSON-ready facts by name; "problems" lists what is odd, each with what to do.
@@ -59,7 +59,7 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         check_frame_of(opened, train, options.min_seen)
     with job.monitor.progress("reading", "Gaussians") as tell:
         statistics = survey(opened, train, tell)
-    if isinstance(orbit, Orbit):
+    if isinstance(orbit, Orbit) and job.cameras.assumed:
         frame = frame_around(opened, orbit)
         sampling = _assumed_facts(statistics, job.cameras, frame, up_evidence(opened, orbit, frame))
     else:

@@ -36,8 +36,8 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     Args:
         scene: a scene, its Gaussians, or the path of its file or folder; of a scene in time each view is drawn at every
             frame, and a path shows it once.
-        cameras: a camera set, its file or folder; or None for those of the scene's model folder, or without one for
-            an orbit around the scene; or an `Orbit` of your own.
+        cameras: a camera set, its file or folder; or None for those in the scene's file or model folder,
+            or without any for an orbit around the scene; or an `Orbit` of your own.
         output: a folder (None: "images"), or one image file for one view.
 
     Raises:

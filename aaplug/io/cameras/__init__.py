@@ -25,6 +25,7 @@ from aaplug.io.cameras import (
     llff,
     multiscale,
     pinhole,
+    sharp,
     supersplat,
     transforms,
     usd,
@@ -70,7 +71,7 @@ class CameraFormat(Protocol):
 
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
-OWN = (pinhole, camera_path, inria.Model(), colmap, blender, inria, multiscale, transforms, llff)
+OWN = (pinhole, camera_path, inria.Model(), colmap, blender, inria, multiscale, transforms, llff, sharp)
 PATH_FORMATS = (camera_path, supersplat, lichtfeld, gltf, usd)
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
+from aaplug.io.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, fractions, sh_of_colour, without_largest, word_quats
 from aaplug.io.scenes.ply_document import Table, stamp_of
-from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.record import warn_of_moves, warn_of_sizes, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors

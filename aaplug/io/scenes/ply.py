@@ -21,10 +21,10 @@ from torch import Tensor
 
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
+from aaplug.io.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of
 from aaplug.io.scenes.packed import sh_of_colour
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
-from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene

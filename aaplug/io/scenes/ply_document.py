@@ -15,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.io.scenes.ply_header import BIG, LITTLE, TEXT, Header
+from aaplug.io.ply_header import BIG, LITTLE, TEXT, Header
 from aaplug.io.scenes.rows import read_rows
 from aaplug.io.values import read_part
 from aaplug.system.errors import FormatError

@@ -6,6 +6,7 @@ Sources, strongest first:
     two scales, or comment SplatRenderMode: 2dgs                        2D Gaussians, treated as classic
     comment SplatRenderMode: mip | antialiased | default                Brush, splat-transform
     comment antialiased 1 | 0                                           Postshot
+    tables of a camera                                                  SHARP, whose renderer adds nothing
     the configuration of the run                                        nerfstudio, gsplat
 Of several comments of a kind the last one counts.  Viewers know only SplatRenderMode; aaplug's record tells a kernel of
 0.1 px² from one of 0.3 px².  Other programs drop the record: see `KERNEL_LOST`.
@@ -16,10 +17,11 @@ Functions raise FormatError for a file that breaks its format.
 import re
 from pathlib import Path
 
-from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, KHR, MIP, Convention
 from aaplug.core.gaussians import Fusion
+from aaplug.io.cameras.sharp import has_camera
+from aaplug.io.ply_header import Header
 from aaplug.io.scenes.columns import FILTER_COLUMN
-from aaplug.io.scenes.ply_header import Header
 from aaplug.io.scenes.record import Facts
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST
 from aaplug.io.values import HEAD_LIMIT, read_start
@@ -116,6 +118,8 @@ def _from_others(header: Header, mode: str | None, two_scales: bool) -> tuple[st
         return f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic", CLASSIC
     if postshot is not None:
         return f"tag in the file: antialiased {postshot}", ANTIALIASED if postshot == "1" else CLASSIC
+    if has_camera(header):
+        return "tables of SHARP in the file: its renderer adds nothing to a splat", KHR
     if _matches(header, NERFSTUDIO):
         return f"{UNTAGGED}nerfstudio writes none, it may be classic or antialiased; assumed classic", CLASSIC
     return f"{UNTAGGED}assumed classic (3DGS default)", CLASSIC

@@ -159,18 +159,18 @@ class Scene:
             return None
 
     @property
-    def camera_folder(self) -> Path | None:
-        """The scene's folder, or the model folder that its file is in, if that holds cameras."""
+    def camera_path(self) -> Path | None:
+        """The scene's file or folder, or the model folder that its file is in, if that holds cameras."""
         path = self.folder or self.source
         if path is None:
             return None
-        folder = Path(os.path.normpath(path.parent / "../..")) if path.absolute().match(MODEL_SCENE) else path
-        return folder if folder.is_dir() and recognized(folder) else None
+        place = Path(os.path.normpath(path.parent / "../..")) if path.absolute().match(MODEL_SCENE) else path
+        return place if recognized(place) else None
 
     @property
     def cameras(self) -> CameraSet | None:
-        """The cameras of `camera_folder`; None if there are none.  Raises as `read_cameras`."""
-        return None if self.camera_folder is None else read_cameras(self.camera_folder)
+        """The cameras of `camera_path`; None if there are none.  Raises as `read_cameras`."""
+        return None if self.camera_path is None else read_cameras(self.camera_path)
 
     @property
     def levels(self) -> Pyramid | None:
