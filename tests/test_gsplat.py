@@ -712,6 +712,22 @@ def test_gsplats_own_markov_chain_runs():
     assert (params["opacities"].sigmoid() > 0.19).all()
 
 
+def test_gsplats_own_selective_adam_moves_visible_gaussians_alone():
+    optimizers = pytest.importorskip("gsplat.optimizers", reason="the package gsplat is not installed")
+    values, visible = torch.randn(3, 5, 2, dtype=F64), torch.tensor([True, False, True, True, False])
+    param = torch.nn.Parameter(values[0].clone())
+    optimizer = optimizers.SelectiveAdam([{"params": [param], "lr": 0.1}], eps=1e-3, betas=(0.8, 0.9))
+    first = second = torch.zeros(5, 2, dtype=F64)
+    expected = values[0]
+    with patch():
+        for gradient in values[1:]:
+            param.grad = gradient
+            optimizer.step(visible)
+            first, second = 0.8 * first + 0.2 * gradient, 0.9 * second + 0.1 * gradient**2
+            expected = torch.where(visible[:, None], expected - 0.1 * first / (second.sqrt() + 1e-3), values[0])
+    torch.testing.assert_close(param.detach(), expected)
+
+
 def test_opacities_may_be_a_column():
     """As nerfstudio's parameters are."""
     opacities, scales, counts = torch.rand(5), torch.rand(5, 3), torch.arange(5)

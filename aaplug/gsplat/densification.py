@@ -1,12 +1,13 @@
-"""Densification steps that gsplat computes on CUDA alone: relocation, and covariances for its noise.
+"""Steps of training that gsplat computes on CUDA alone: relocation, covariances for its noise, and selective Adam.
 
-n: Gaussians; b: leading dimensions.  3DGS-MCMC is Kheradmand et al. 2024, arXiv 2404.09591.
+n: Gaussians; b: leading dimensions.  3DGS-MCMC is Kheradmand et al. 2024, arXiv 2404.09591; Taming 3DGS is Mallick et
+al. 2024, arXiv 2406.15643.
 """
 
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -60,3 +61,22 @@ def quat_scale_to_covar_preci(
         return matrices[..., rows, columns] if triu else matrices
 
     return of(scales) if compute_covar else None, of(1 / scales) if compute_preci else None
+
+
+@contract
+@torch.no_grad()
+def adam(
+    param: Float[Tensor, "n ..."],
+    param_grad: Float[Tensor, "n ..."],
+    exp_avg: Float[Tensor, "n ..."],
+    exp_avg_sq: Float[Tensor, "n ..."],
+    valid: Bool[Tensor, " n"],
+    lr: float,
+    b1: float,
+    b2: float,
+    eps: float,
+) -> None:
+    """A step of Adam in place, without its correction of bias, for the Gaussians that `valid` marks (Taming 3DGS)."""
+    for average, rate, value in ((exp_avg, b1, param_grad), (exp_avg_sq, b2, param_grad.square())):
+        average[valid] = average[valid].lerp(value[valid], 1 - rate)
+    param[valid] -= lr * exp_avg[valid] / (exp_avg_sq[valid].sqrt() + eps)

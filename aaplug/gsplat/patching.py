@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
+from aaplug.gsplat.densification import adam, compute_relocation, quat_scale_to_covar_preci
 from aaplug.gsplat.harmonics import spherical_harmonics
 from aaplug.gsplat.rendering import rasterization, rasterization_2dgs
 from aaplug.system.errors import UsageError
@@ -15,7 +15,7 @@ from aaplug.system.errors import UsageError
 REPLACED: dict[str, list[Callable[..., Any]]] = {  # by the modules that define them
     "gsplat.rendering": [rasterization, rasterization_2dgs],
     "gsplat.relocation": [compute_relocation],
-    "gsplat.cuda._wrapper": [quat_scale_to_covar_preci, spherical_harmonics],
+    "gsplat.cuda._wrapper": [adam, quat_scale_to_covar_preci, spherical_harmonics],
 }
 OLDEST = [1, 5]  # version of gsplat whose strategies read a radius along each axis, as `meta` has
 
