@@ -209,6 +209,6 @@ def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):
 
 
 def test_without_the_extra_its_name_is_told(cli, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.job.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     said = f"error: --scheduler: needs the extra `cluster`: {install_command('cluster')}"
     assert cli.refused("render scene.ply --cameras . -o out --rasterizer eager --scheduler local") == said

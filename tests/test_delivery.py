@@ -254,11 +254,10 @@ def test_stages_of_several_files_and_odd_ones_are_refused(tmp_path: Path, change
 
 
 def test_usd_scenes_without_the_package_name_the_extra(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("aaplug.io.scenes.usd.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     with pytest.raises(UsageError, match="need the extra `usd`"):
         read_scene(tmp_path / "a.usda")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"needs pxr: .*\[usd\]"):
         write_scene(tmp_path / "b.usdz", oracle())
     assert [file.name for file in tmp_path.iterdir()] == ["a.usda"]

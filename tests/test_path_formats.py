@@ -4,7 +4,6 @@ import base64
 import json
 import math
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -271,7 +270,7 @@ def test_no_layer_is_read_beyond_the_folder(tmp_path, layer):
 
 
 def test_usd_without_its_package_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pxr.Tf", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UsageError, match="usd"):
         read_camera_path(written(tmp_path, "path.usda", USDA))
 

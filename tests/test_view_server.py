@@ -260,7 +260,7 @@ def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
 
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):  # noqa: F811
-    monkeypatch.setattr("aaplug.verbs.view.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=re.escape(install_command("view"))):
         view(*seen, port=0)
 

@@ -8,7 +8,6 @@ scikit-image with Gaussian weights and torchmetrics do; "3dgs" pads with zeros a
 script does, and so reads higher the smaller the image (by 0.003 at 512 px, 0.0085 at 64 px).
 """
 
-import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +25,7 @@ from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
 from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
 from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -63,8 +62,7 @@ def flip(image: Image, truth: Image) -> float | None:
 
     Raises UsageError if the package that computes it is not installed.
     """
-    if importlib.util.find_spec("flip_evaluator") is None:
-        raise UsageError("FLIP", f"needs the package flip-evaluator: {install_command('flip')}")
+    check_installed("flip_evaluator", "flip", "FLIP", "needs the package flip-evaluator")
     import flip_evaluator  # pyright: ignore[reportMissingImports]
 
     a, b = (np.ascontiguousarray(x.float().cpu().numpy()) for x in (truth, image))

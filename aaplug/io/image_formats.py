@@ -3,14 +3,13 @@
 They are plain data and import no torch, so that the command line knows their names at once; `io.layers` writes them.
 """
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.system.errors import UsageError, listing
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 
 
 @dataclass(frozen=True)
@@ -28,11 +27,6 @@ class ImageFormat:
     bit_depths: tuple[int, ...]
     colours: tuple[str, ...] = ("srgb",)
     needs: str | None = None
-
-    @property
-    def lacks(self) -> bool:
-        """True if the package that writes it is not installed."""
-        return self.needs is not None and importlib.util.find_spec(self.needs) is None
 
 
 # Values of colours, with the name of KHR_gaussian_splatting for each: those that a display takes (IEC 61966-2-1), as
@@ -80,8 +74,8 @@ class Storage:
         if format is not None and by_name not in (format, None):
             raise UsageError("format", f"is {format}, but {output.name} is named as a .{by_name}")
         chosen = IMAGE_FORMATS[format or by_name or "png"]
-        if chosen.lacks:
-            raise UsageError("format", f"{chosen.name} needs {chosen.needs}: {install_command(chosen.name)}")
+        if chosen.needs is not None:
+            check_installed(chosen.needs, chosen.name, "format", f"{chosen.name} needs {chosen.needs}")
         asked = tuple(dict.fromkeys([*passes, *["alpha"] * transparent]))
         if normal_axes != "camera" and "normal" not in asked:
             raise UsageError("normal_axes", "are of the pass normal, which `passes` leaves out")

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -38,7 +37,7 @@ from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, ProcessesIfLong, given_threads, torch_threads
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 from aaplug.system.monitor import Monitor
 
 LONG_JOB = 60.0  # seconds of work from which a job is announced
@@ -254,8 +253,7 @@ def running(
         if not isinstance(scheduler, str):
             yield Workers(threads, scheduler)
             return
-        if find_spec("distributed") is None:
-            raise UsageError("scheduler", f"needs the extra `cluster`: {install_command('cluster')}")
+        check_installed("distributed", "cluster", "scheduler", "needs the extra `cluster`")
         from aaplug.system.cluster import connected  # its package is an extra
 
         if output is not None:

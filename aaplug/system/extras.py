@@ -1,12 +1,20 @@
 """The packages that only some parts of aaplug need: its extras."""
 
+import importlib.util
 import json
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from aaplug.system.errors import UsageError
 from aaplug.system.shells import command_line
+
+
+def check_installed(package: str, extra: str, where: str, problem: str) -> None:
+    """Raise UsageError at `where`, with `problem` and the command that helps, if a package of an extra is missing."""
+    if importlib.util.find_spec(package) is None:
+        raise UsageError(where, f"{problem}: {install_command(extra)}")
 
 
 def install_command(extra: str) -> str:

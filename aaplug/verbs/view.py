@@ -5,7 +5,6 @@ import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.resources import as_file, files
-from importlib.util import find_spec
 from pathlib import Path
 
 from aaplug.io.scenes import SceneLike
@@ -13,8 +12,7 @@ from aaplug.methods import RECIPES
 from aaplug.options.shared import RECIPE_NAMES
 from aaplug.options.verbs import LiveOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.system.errors import UsageError
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
@@ -28,8 +26,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
 
     Arguments and errors: see `view`.
     """
-    if find_spec("websockets") is None:
-        raise UsageError("view", f"needs the extra `view`: {install_command('view')}")
+    check_installed("websockets", "view", "view", "needs the extra `view`")
     from aaplug.live.server import Server  # its package is an extra
     from aaplug.live.studio import Studio
     from aaplug.live.subject import Subject

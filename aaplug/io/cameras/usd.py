@@ -20,7 +20,7 @@ from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
 from aaplug.io.values import Place, focal, number
 from aaplug.system.errors import FormatError, UsageError
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 
 UNIT = 10.0  # of the camera's lengths in a world unit
 MAX_LAYERS = 1000
@@ -33,13 +33,10 @@ def sniff(path: Path) -> bool:
 
 def path_of(path: Path, fps: float | None = None) -> CameraPath:
     """The camera at each frame, or at rest as a path of one; fps: how many a second, None for the stage's own."""
-    try:
-        Tf = module("Tf")
-    except ImportError as error:
-        raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}") from error
+    check_installed("pxr", "usd", "path", f"{path.suffix} files need the extra `usd`")
     try:
         return _read(path, fps)
-    except (Tf.ErrorException, UnicodeDecodeError) as error:  # its message may be no text
+    except (module("Tf").ErrorException, UnicodeDecodeError) as error:  # its message may be no text
         raise FormatError(path, "cannot be read: it breaks the format of USD") from error
 
 

@@ -6,7 +6,6 @@ accepts it: plug-ins first, as they may read a dialect of a file that an own for
 in the format whose name ends the file's name.
 """
 
-import importlib.util
 import logging
 import re
 from collections.abc import Iterable, Iterator
@@ -29,7 +28,7 @@ from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFram
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, PlugInError, UsageError, listing
-from aaplug.system.extras import install_command
+from aaplug.system.extras import check_installed
 from aaplug.system.plug_ins import asked
 from aaplug.system.registry import Registry, named
 
@@ -256,9 +255,9 @@ def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath]
     if writer is None:
         known = [_ending(format) for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
-    if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        command = install_command(getattr(writer, "extra", writer.name))
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {command}")
+    if writer.needs is not None:
+        problem = f"writing .{writer.name} needs {writer.needs}"
+        check_installed(writer.needs, getattr(writer, "extra", writer.name), str(path), problem)
     check_output(path, overwrite, inputs)
     return writer
 

@@ -15,7 +15,6 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,8 @@ from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, text
-from aaplug.system.errors import FormatError, OutputError, UsageError
-from aaplug.system.extras import install_command
+from aaplug.system.errors import FormatError, OutputError
+from aaplug.system.extras import check_installed
 from aaplug.system.locks import scratch
 
 SUFFIXES = ("usda", "usdc", "usdz", "usd")
@@ -64,8 +63,7 @@ class UsdFormat:
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         """All prims of splats as one scene, in memory; read by `usd_child`."""
-        if find_spec(PACKAGE) is None:
-            raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}")
+        check_installed(PACKAGE, self.extra, "path", f"{path.suffix} files need the extra `usd`")
         with library_errors(path), scratch() as folder:
             told, arrays = _told(path, folder / "arrays.npz")
             stage = object_of(told, path, "the stage", "what is in it")
