@@ -6,6 +6,7 @@ import shutil
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,14 @@ from numpy.lib import recfunctions as rfn
 
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.placing import placed
+from aaplug.core.placing import mirrored, placed
 from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.lcc import FAR_RECORD, Z_UP
 
 DATA = Path(__file__).resolve().parent / "data"
 ORACLE = DATA / "oracle.ply"  # random, 40 Gaussians of degree 3, tagged mip; the others are made of it
+half_turn_about_x = partial(mirrored, signs=(1.0, -1.0, -1.0))
 
 
 def write_json(path: Path, document: object) -> Path:

@@ -16,7 +16,6 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.images import write_png
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene import Scene
 from aaplug.options.shared import Orbit, ViewOptions
 from aaplug.rendering.agreement import Agreement, agreement, settled
@@ -25,6 +24,7 @@ from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FrameError
 from tests.conftest import make_camera, make_scene
+from tests.scene_files import half_turn_about_x
 
 
 def fit_of(scene, cameras) -> Agreement:

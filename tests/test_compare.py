@@ -22,10 +22,9 @@ from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_she
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.system.executors import load, save
 from tests.conftest import EYES, make_scene
-from tests.scene_files import DATA
+from tests.scene_files import DATA, half_turn_about_x
 from tests.test_batch import killed_at
 
 WORDS = "--cameras . --rasterizer eager --views train --scale 0.5 1 2"

@@ -26,14 +26,13 @@ from aaplug.io.scenes import (
     usd,
     write_scene,
 )
-from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE
-from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file
+from tests.scene_files import DATA, MADE, half_turn_about_x, ksplat, oracle, splat, splats, write_file
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(

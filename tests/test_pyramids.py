@@ -24,9 +24,10 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.pyramid_folder import MANIFEST, hash_of, read_manifest, read_pyramid
+from aaplug.io.scenes.pyramid_folder import MANIFEST, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merge_in_chunks
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import FormatError
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.lod import lod
@@ -343,7 +344,7 @@ def test_a_levels_hash_covers_all_of_its_bytes(tmp_path):
     for place in (0, 1 << 17, 1 << 19, len(data) - 1):
         data[place] = 1
         (tmp_path / "level.ply").write_bytes(data)
-        hashes.add(hash_of(tmp_path / "level.ply"))
+        hashes.add(digest_of_files([tmp_path / "level.ply"]))
     assert len(hashes) == 4
 
 

@@ -95,9 +95,9 @@ def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor,
     return _resized(rgb, hw, cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC)
 
 
-def quantised(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
-    """The colours of a PNG of this image that is read back."""
-    return levels(rgb, bit_depth) / (2**bit_depth - 1)
+def quantised(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """The colours of a PNG of 8 bits of this image that is read back."""
+    return levels(rgb, 8) / 255
 
 
 def levels(rgb: Float[Tensor, "h w c"], bit_depth: int) -> Float[Tensor, "h w c"]:

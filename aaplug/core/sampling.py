@@ -158,7 +158,9 @@ def rates_in_chunks(
         rates = torch.where(visible, focal / z, 0.0)
         for i, camera in enumerate(cameras):
             if camera.lens != PINHOLE:
-                rates[:, i] = _through(means[part], camera)
+                places, depths, sampled, _ = sights(means[part], camera)
+                inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
+                rates[:, i] = torch.where((depths > NEAR) & inside, sampled, 0.0)
         yield part, rates
 
 
@@ -167,13 +169,6 @@ def mean_position(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
     if not cameras:
         raise UsageError("cameras", "there are none, and sampling bounds need at least one")
     return torch.stack([camera.centre for camera in cameras]).mean(dim=0)
-
-
-def _through(means: Float[Tensor, "c 3"], camera: Camera) -> Float[Tensor, " c"]:
-    """Rates through a lens."""
-    places, depths, rates, _ = sights(means, camera)
-    inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
-    return torch.where((depths > NEAR) & inside, rates, 0.0)
 
 
 def _inside(position: Float[Tensor, "c v"], side: Float[Tensor, " v"]) -> Bool[Tensor, "c v"]:

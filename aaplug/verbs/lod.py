@@ -38,7 +38,7 @@ from aaplug.rendering.assumed import PROBE_ROWS
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
-from aaplug.system.digests import digest_of_values
+from aaplug.system.digests import digest_of_files, digest_of_values
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
 from aaplug.verbs.verb import IS_COMPLETE, writes
 
@@ -269,7 +269,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
             if pyramid:
                 assert made.chunks is not None
                 counts = torch.bincount(made.chunks, minlength=len(leaves)).tolist()
-                digest = pyramid_folder.hash_of(files[place])
+                digest = digest_of_files([files[place]])
                 entry = pyramid_folder.LevelFile(files[place].name, level.rate, digest, tuple(counts))
                 manifest = replace(manifest, levels=(*manifest.levels, entry))
                 pyramid_folder.write_manifest(pyramid, manifest)

@@ -46,14 +46,14 @@ def nearest_value(values: Float[Tensor, "*n"], levels: Float[Tensor, " p"]) -> I
 def palette(rows: Float[Tensor, "n c"], entries: int) -> tuple[Float[Tensor, "p c"], Int[Tensor, " n"]]:
     """At most `entries` rows that stand for all, and the index of each row's.  In one thread: the groups are small.
 
-    Rows are halved along their main direction until there are few in a group, so that the time does not grow with n·p;
-    each group gets entries by the square root of its size times its squared error.
+    Groups are halved at the median of their main direction until few rows are in each, so that the time does not grow
+    with n·p; each group gets entries by the square root of its size times its squared error.
     """
     if len(rows) <= entries:
         return rows, torch.arange(len(rows))
     groups = [torch.arange(len(rows))]
     while len(groups) < COARSE and len(groups[0]) > MIN_GROUP:
-        groups = [half for each in groups for half in _halves(rows, each)]
+        groups = [half for each in groups for half in each[_along(rows[each])].tensor_split((len(each) // 2,))]
     sizes = torch.tensor([len(each) for each in groups])
     spread = torch.stack([(rows[each] - rows[each].mean(dim=0)).square().sum() for each in groups])
     weight = (spread.double() * sizes).sqrt()
@@ -64,12 +64,6 @@ def palette(rows: Float[Tensor, "n c"], entries: int) -> tuple[Float[Tensor, "p 
         labels[each] = own + sum(map(len, centres))
         centres.append(found)
     return torch.cat(centres), labels
-
-
-def _halves(rows: Float[Tensor, "n c"], group: Int[Tensor, " g"]) -> tuple[Tensor, Tensor]:
-    """A group's rows on either side of the median along their main direction."""
-    order = _along(rows[group])
-    return group[order[: len(group) // 2]], group[order[len(group) // 2 :]]
 
 
 def _along(rows: Float[Tensor, "n c"]) -> Int[Tensor, " n"]:

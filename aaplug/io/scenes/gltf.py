@@ -165,7 +165,7 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Te
     if SPZ in inner:
         view, _ = document.view(inner.entry(SPZ))
         header, sections, _ = spz.parsed(document.path, view.read(0, view.size))
-        count, degree, load = header.count, header.degree, partial(spz.rows, header, sections, spz.TURNS["opencv"])
+        count, degree, load = header.count, header.degree, partial(spz.rows, header, sections, "RDF")
     else:
         attributes = primitive.entry("attributes")
         degree = max((d for d in range(MOST_DEGREE + 1) if harmonics(d)[-1] in attributes), default=0)

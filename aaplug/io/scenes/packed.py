@@ -32,7 +32,6 @@ HASH_DIGITS = 8  # in the name of a file that another one names
 UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
 Piece = tuple[int, Callable[[int, int], Gaussians]]  # of a scene: how many rows, what reads those from start up to stop
 half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
-half_turn_about_x = partial(mirrored, signs=(1.0, -1.0, -1.0))  # from OpenGL's axes to OpenCV's, and back
 
 
 def check_growth(path: Path, inflated: int, compressed: int) -> None:

@@ -7,7 +7,6 @@ training's that a level is meant for.  hash: SHA-256 of the file.  chunks: how m
 but the finest, which keeps the scene's order, lie chunk by chunk.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.values import entries, natural, number, object_of, read_json, text
+from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import FormatError
 
 MANIFEST = "lod.json"
@@ -139,12 +139,6 @@ def write_manifest(folder: AnyPath, manifest: Manifest) -> None:
     write_file(Path(folder) / MANIFEST, content, overwrite=True)
 
 
-def hash_of(path: Path) -> str:
-    """SHA-256 of a file, in hex; raises OSError if it cannot be read."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def path_of(folder: Path, level: LevelFile) -> Path:
     """The file of a level.
 
@@ -154,6 +148,6 @@ def path_of(folder: Path, level: LevelFile) -> Path:
     path = folder / level.file
     if not path.is_file():
         raise FormatError(path, f"is missing: {MANIFEST} names it as a level; `aaplug lod --overwrite` makes it again")
-    if hash_of(path) != level.hash:
+    if digest_of_files([path]) != level.hash:
         raise FormatError(path, f"is not the level that {MANIFEST} names: it was changed, cut short or exchanged")
     return path

@@ -15,7 +15,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,15 +31,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored
 from aaplug.io.atomic import write_file
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.packed import (
-    byte_opacities,
-    bytes_of,
-    check_growth,
-    floats,
-    half_turn_about_x,
-    largest_last,
-    without_largest,
-)
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, check_growth, floats, largest_last, without_largest
 from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves, warn_of_sizes
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
@@ -67,14 +59,14 @@ ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 RECORD = struct.Struct("<II")  # an extension's type and length
 COORDINATES = 0xADBE0003  # the type SPZ_ADOBE_coordinate_system: one of these numbers
 AXES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")  # where x, y and z point, by number
-AXES_WRITTEN = {"opengl": "RUB", "opencv": "RDF"}
 ZSTD_LEVEL = 9
-# TURNS lead from the axes of the file to OpenCV's, and back.
-TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {"opengl": half_turn_about_x, "opencv": lambda scene: scene}
-AXES_NOTES = {
-    "opengl": "axes turned from OpenGL's to OpenCV's, by the specification "
-    "(`spz_axes` opencv if the writer did not turn them, as splat-transform and gsply)",
-    "opencv": "axes as stored (`spz_axes` opencv)",
+NAMED_AXES = {  # axes, and a note, by `spz_axes`
+    "opengl": (
+        "RUB",
+        "axes turned from OpenGL's to OpenCV's, by the specification "
+        "(`spz_axes` opencv if the writer did not turn them, as splat-transform and gsply)",
+    ),
+    "opencv": ("RDF", "axes as stored (`spz_axes` opencv)"),
 }
 
 name = "spz"
@@ -112,16 +104,15 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     if header.flags & ANTIALIASED_FLAG:
         convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
 
-    def reading(turn: Callable[[Gaussians], Gaussians], note: str, other: Scene | None = None) -> Scene:
-        load, notes = partial(rows, header, sections, turn), (f"version {header.version}", note)
+    def reading(axes: str, note: str, other: Scene | None = None) -> Scene:
+        load, notes = partial(rows, header, sections, axes), (f"version {header.version}", note)
         return Scene(path, name, header.count, header.degree, load, evidence, convention, notes=notes, other=other)
 
     if options.spz_axes != "auto":
-        return reading(TURNS[options.spz_axes], AXES_NOTES[options.spz_axes])
+        return reading(*NAMED_AXES[options.spz_axes])
     if axes is not None:
-        signs = [1.0 if axis in "RDF" else -1.0 for axis in axes]
-        return reading(partial(mirrored, signs=signs), f"axes turned from {axes}, which the file states, to RDF")
-    return reading(TURNS["opengl"], AXES_NOTES["opengl"], reading(TURNS["opencv"], AXES_NOTES["opencv"]))
+        return reading(axes, f"axes turned from {axes}, which the file states, to RDF")
+    return reading(*NAMED_AXES["opengl"], reading(*NAMED_AXES["opencv"]))
 
 
 def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | None]:
@@ -218,10 +209,8 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[list[bytes], by
     return sections, data[HEADER_4.size : table]
 
 
-def rows(
-    header: Header, sections: list[np.ndarray], turn: Callable[[Gaussians], Gaussians], start: int, stop: int
-) -> Gaussians:
-    """The rows from start up to stop, turned by `turn`."""
+def rows(header: Header, sections: list[np.ndarray], axes: str, start: int, stop: int) -> Gaussians:
+    """The rows from start up to stop, of a file in these axes."""
     positions, alphas, colours, scales, quats, harmonics = (section[start:stop] for section in sections)
     n, k = len(positions), (header.degree + 1) ** 2
     sh = torch.zeros(n, k, 3)
@@ -238,7 +227,12 @@ def rows(
         fixed = low | middle << 8 | high.astype(np.uint8).view(np.int8).astype(np.int32) << 16
         means = torch.from_numpy(fixed.astype(np.float64) / 2**header.fraction).float()
     log_scales = floats(scales) / SCALE_STEPS + MIN_LOG_SCALE
-    return turn(Gaussians(means, unit, log_scales, byte_opacities(alphas[:, 0]), sh))
+    return _turned(Gaussians(means, unit, log_scales, byte_opacities(alphas[:, 0]), sh), axes)
+
+
+def _turned(scene: Gaussians, axes: str) -> Gaussians:
+    """The scene from these axes to OpenCV's, RDF, or back."""
+    return scene if axes == "RDF" else mirrored(scene, [1.0 if axis in "RDF" else -1.0 for axis in axes])
 
 
 def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
@@ -253,9 +247,9 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene, with values rounded to the format's steps."""
-    axes = "opengl" if options.spz_axes == "auto" else options.spz_axes
-    scenes = [TURNS[axes](part) for part in parts]
-    content = packed(path, scenes, options.spz_version, AXES_WRITTEN[axes])
+    axes, _ = NAMED_AXES["opengl" if options.spz_axes == "auto" else options.spz_axes]
+    scenes = [_turned(part, axes) for part in parts]
+    content = packed(path, scenes, options.spz_version, axes)
     kept = Facts("", COMPENSATED if scenes[0].convention.compensated else CLASSIC)
     warn_of_losses(path, name, scenes[0], kept)
     write_file(path, content, overwrite)
