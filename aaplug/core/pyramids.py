@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,6 +35,21 @@ CUTOFF_SIGMAS = 3.33  # standard deviations at which an opaque Gaussian's alpha 
 FILTER_REACH = 4.0  # px around the image that filters reach at most, at training's rate and below
 FLOAT32_SLACK = 1e-6  # of the camera's distance from the origin: float32 may lose this in the camera's frame
 MAX_STRETCH = 1 + JACOBIAN_MARGIN  # largest ratio of a projected Gaussian's length outside of the image to its own
+
+
+class Level(NamedTuple):
+    """A lighter scene.
+
+    rate: the lowest sampling rate relative to training's that it is meant for.
+    chunks: of each Gaussian; None if it belongs to no pyramid.
+    parents: of each Gaussian of the level before, the place of the one that stands for it; None if that is not known;
+        where none does, that of a neighbour's.
+    """
+
+    scene: Gaussians
+    rate: float
+    chunks: Int[Tensor, " n"] | None = None
+    parents: Int[Tensor, " m"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

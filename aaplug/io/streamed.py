@@ -28,11 +28,12 @@ from torch import Tensor
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.orbits import Frame
 from aaplug.core.placing import box_of
+from aaplug.core.pyramids import Level
 from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing, write_file
 from aaplug.io.rad import MAX_NODE_SIZE, rad_of, tree_of
 from aaplug.io.scenes import gltf, read_scene, write_scene
-from aaplug.io.scenes.pyramid_folder import MAX_GAUSSIANS, Level
+from aaplug.io.scenes.pyramid_folder import MAX_GAUSSIANS
 from aaplug.io.scenes.rows import library_errors
 from aaplug.io.values import Place, natural, numbers, object_of, read_json
 from aaplug.system.errors import FormatError, OutputError, UsageError, reason

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +16,7 @@ from torch.nn.functional import pad
 
 from aaplug.core.chunks import curve, squeezed
 from aaplug.core.gaussians import Fusion, Gaussians, joined
+from aaplug.core.pyramids import Level
 from aaplug.levels.clusters import Clusters, clusters_of, gaussians_of, merge_pairs
 from aaplug.levels.covariances import areas, blur, covariances
 from aaplug.levels.pairing import Edges, edges_below, matching
@@ -33,6 +33,8 @@ FIRST_SHARE = 0.01  # of the tolerance in the first rounds, so that a bad pair d
 FIRST_OF_COUNT, LAST_OF_COUNT = 1e-7, 1e3  # px²: first and last but one tolerance, where a count is asked for
 TOLERANCE_STEP = 10.0  # from one tolerance to the next
 GAUSSIANS_PER_BATCH = 1 << 17  # of whole chunks, merged at once: some 300 MB
+
+Batch = tuple[Gaussians, Int[Tensor, " m"], Int[Tensor, " n"]]  # a lighter scene, its chunks and the parents in it
 
 
 @dataclass(frozen=True)
@@ -72,19 +74,6 @@ class Goal:
         return cls(0.5**level, tolerance=TOLERANCE, smallest=smallest)
 
 
-class Lighter(NamedTuple):
-    """A lighter scene.
-
-    chunks: of each of its Gaussians, ascending.
-    parents: of each Gaussian of the heavier scene, the place of the one that stands for it; where none does, that of a
-        neighbour's.
-    """
-
-    scene: Gaussians
-    chunks: Int[Tensor, " m"]
-    parents: Int[Tensor, " n"]
-
-
 def merge(
     scene: Gaussians,
     rates: Float[Tensor, " n"],
@@ -109,8 +98,8 @@ def merge_in_chunks(
     goal: Goal,
     tell: Tell = lambda done, total: None,
     visible: Float[Tensor, " n"] | None = None,
-) -> Lighter:
-    """A lighter scene; see `merge`.
+) -> Level:
+    """A lighter scene, its Gaussians by ascending chunk; see `merge`.
 
     No Gaussian of it stands for those of different chunks.  2D Gaussians stay flat: discs across the thinnest axes of
     the covariances that they are merged to.
@@ -127,7 +116,7 @@ def merge_in_chunks(
     gone = dict.fromkeys(stops, 0)  # Gaussians that a batch is rid of, by its start
 
     @on_free_cores()
-    def merge_batch(ends: tuple[int, int]) -> Lighter:
+    def merge_batch(ends: tuple[int, int]) -> Batch:
         def tell_batch(done: int) -> None:
             gone[ends[0]] = done
             tell(min(sum(gone.values()), total), total)
@@ -137,14 +126,14 @@ def merge_in_chunks(
         return _merge_batch(clusters_of(batch, rates[places], chunks[places], visible[places]), batch, goal, tell_batch)
 
     workers = min(given_threads(), len(stops) - 1)
-    parts = [*(Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))]
-    lighter = replace(joined([part.scene for part in parts]), origin=None)
+    batches = (Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))
+    scenes, placed, above = zip(*batches, strict=True)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
-    starts = accumulate((len(part.scene) for part in parts), initial=0)
+    lighter = replace(joined(scenes), origin=None, fused=(*scene.fused, record))
+    starts = accumulate(map(len, scenes), initial=0)
     parents = torch.empty_like(order)
-    parents[order] = torch.cat([part.parents + start for part, start in zip(parts, starts, strict=False)])
-    chunks = torch.cat([part.chunks for part in parts])
-    return Lighter(replace(lighter, fused=(*scene.fused, record)), chunks, parents.clamp(0))
+    parents[order] = torch.cat([each + start for each, start in zip(above, starts, strict=False)])
+    return Level(lighter, goal.rate, torch.cat(placed), parents.clamp(0))
 
 
 def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
@@ -174,7 +163,7 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
     return clusters
 
 
-def _merge_batch(clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Lighter:
+def _merge_batch(clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Batch:
     """The lighter scene of one batch, without hidden Gaussians unless their count is the goal."""
     result = rounds(clusters, goal, tell)
     lighter, chunks, parents = gaussians_of(result, scene, clusters.weights), result.chunks, result.labels
@@ -183,7 +172,7 @@ def _merge_batch(clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callabl
         visible = stays.nonzero()[:, 0]
         lighter, chunks, parents = lighter[visible], chunks[visible], (stays.cumsum(0) - 1)[parents]
     tell(len(scene))
-    return Lighter(lighter, chunks, parents)
+    return lighter, chunks, parents
 
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:

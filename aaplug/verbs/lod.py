@@ -15,6 +15,7 @@ from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.gaussians import Gaussians, digest_of_scene, joined
 from aaplug.core.orbits import frame_of
+from aaplug.core.pyramids import Level
 from aaplug.core.sampling import check_frame, median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
@@ -25,7 +26,7 @@ from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
 from aaplug.io.scenes import SceneLike, check_scene_output, pyramid_folder, write_scene, written_format
 from aaplug.io.scenes.columns import matrix_of
 from aaplug.io.scenes.ply import beside
-from aaplug.io.scenes.pyramid_folder import MANIFEST, Level
+from aaplug.io.scenes.pyramid_folder import MANIFEST
 from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import STREAMS, Front
 from aaplug.levels.clusters import rates_of
@@ -149,8 +150,7 @@ class _Maker:
             if before.chunks is None:
                 level = Level(merge(scene, rates, goal, tell, visible), goal.rate)
             else:
-                lighter = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
-                level = Level(lighter.scene, goal.rate, lighter.chunks, lighter.parents)
+                level = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
         monitor.say(f"{counted(len(level.scene), 'Gaussian')} for {goal.rate:.3g} × the training rate")
         return self._tuned(level) if self.viewer is None else level
 

@@ -11,15 +11,11 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from aaplug.core.chunks import chunks_of
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.pyramids import Pyramid
+from aaplug.core.pyramids import Level, Pyramid
 from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.rows import SceneFileOptions
@@ -57,20 +53,6 @@ class Manifest:
         """In words."""
         counts = " > ".join(f"{sum(level.chunks):,}" for level in self.levels)
         return f"{len(self.levels)} levels of detail: {counts} Gaussians, down to {self.levels[-1].rate:.3g} × training"
-
-
-class Level(NamedTuple):
-    """A lighter scene.
-
-    rate: the lowest sampling rate relative to training's that it is meant for.
-    chunks: of each Gaussian; None if it belongs to no pyramid.
-    parents: of each Gaussian of the level before, the place of the one that stands for it; None if that is not known.
-    """
-
-    scene: Gaussians
-    rate: float
-    chunks: Int[Tensor, " n"] | None = None
-    parents: Int[Tensor, " m"] | None = None
 
 
 def is_pyramid(folder: AnyPath) -> bool:
