@@ -54,7 +54,7 @@ def test_a_merged_pair_alone_keeps_the_integral_of_its_alpha():
     scene = pair(0.7, 0.25)
     rates = torch.full((2,), 1e4)  # training's dilation vanishes
     clusters = clusters_of(scene, rates)
-    both = merge_pairs(clusters[:1], clusters[1:])
+    both = merge_pairs(*(clusters[torch.tensor([place])] for place in range(2)))
     x = torch.linspace(-2, 2, 401, dtype=torch.float64)
     found = []
     for plane in ((0, 1), (1, 2), (2, 0)):
@@ -73,7 +73,7 @@ def test_opaque_pairs_never_exceed_the_cap_and_grow_instead():
     one = merged_to(1, scene)
     assert one.opacities.item() == pytest.approx(MAX_OPACITY, abs=1e-6)
     plain = clusters_of(scene, torch.full((2,), RATE))
-    moments = merge_pairs(plain[:1], plain[1:])
+    moments = merge_pairs(*(plain[torch.tensor([place])] for place in range(2)))
     assert moments.opacities.item() > 1
     assert area(covariances(one)).item() > area(moments.covs).item() * 1.02
 

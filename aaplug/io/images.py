@@ -212,7 +212,7 @@ def _still(path: Path, data: bytes) -> bytes:
 
 @contextmanager
 def captured_stderr() -> Iterator[IO[bytes]]:
-    """Capture what libpng, libjpeg and FFmpeg print: it names no file and would break a progress bar."""
+    """Capture what libpng and libjpeg print: it names no file and would break a progress bar."""
     with tempfile.TemporaryFile() as words:
         saved = os.dup(STDERR)
         os.dup2(words.fileno(), STDERR)

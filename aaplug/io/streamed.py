@@ -206,7 +206,7 @@ def write_index(
         content, settings = rad_of(tree_of(front.scene, front.parents)), _spark_settings(front)
     else:
         parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
-        index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
+        index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
         content = _json(index)
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
@@ -277,16 +277,15 @@ Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's se
 
 
 def _lod_meta(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> Indexed:
-    counts = [sum(part.size for part in level) for level in zip(*parts, strict=True)]
-    filenames, children = [], []
-    for leaf, levels in enumerate(parts):
+    counts, filenames, children = [sum(part.size for part in level) for level in parts], [], []
+    for leaf, levels in enumerate(zip(*parts, strict=True)):
         lods = {}
         for number, part in enumerate(levels):
             if part.size:
                 lods[str(number)] = {"file": len(filenames), "offset": 0, "count": part.size}
                 filenames.append(stream.part(number, leaf))
         children.append({"bound": _bound(_box(levels)), "lods": lods})
-    tree = {"bound": _bound(_box([part for levels in parts for part in levels])), "children": children}
+    tree = {"bound": _bound(_box([part for level in parts for part in level])), "children": children}
     facts = {"version": 1, "asset": {"generator": "aaplug"}, "count": counts[0], "counts": counts}
     settings = {
         "app.scene.gsplat": {"antiAlias": True, "splatBudgetMode": "limit", "splatBudget": 0},
@@ -302,7 +301,7 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
         return MAX_SCREEN_ERROR * 2.0**number / (TILE_SWITCH * rate)
 
     tiles = []
-    for leaf, levels in enumerate(parts):
+    for leaf, levels in enumerate(zip(*parts, strict=True)):
         volume, tile = _volume(_box(levels)), None
         for number, part in enumerate(levels):
             if part.size:
@@ -313,13 +312,13 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
         tiles.append(tile)
     root = {
         "transform": torch.eye(4).flatten().tolist(),
-        "boundingVolume": _volume(_box([part for levels in parts for part in levels])),
-        "geometricError": ALWAYS * error(len(parts[0]) - 1),
+        "boundingVolume": _volume(_box([part for level in parts for part in level])),
+        "geometricError": ALWAYS * error(len(parts) - 1),
         "refine": "REPLACE",
         "children": tiles,
     }
     extension = {"extensionsUsed": SPLATS, "extensionsRequired": SPLATS}
-    counts = [sum(part.size for part in level) for level in zip(*parts, strict=True)]
+    counts = [sum(part.size for part in level) for level in parts]
     index = {
         "asset": {"version": "1.1", "generator": "aaplug", "extras": {"counts": counts}},
         "extensionsUsed": ["3DTILES_content_gltf"],

@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -54,15 +55,12 @@ class Model:
     lens: Callable[[tuple[float, ...]], Lens] | None = None
 
 
-def _fisheye(coefficients: tuple[float, ...]) -> Lens:
-    return opencv_lens(coefficients, fisheye=True)
-
-
 def _thin_prism_fisheye(coefficients: tuple[float, ...]) -> Lens:
     k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
     return Lens("equidistant", (k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0))
 
 
+_fisheye = partial(opencv_lens, fisheye=True)
 MODELS = (  # by COLMAP's model id
     Model("SIMPLE_PINHOLE", 3, 1, True),
     Model("PINHOLE", 4, 2, True),

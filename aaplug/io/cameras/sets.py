@@ -23,13 +23,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class CameraFileOptions:
-    """The user's choices; None means what the files say, or else the format's custom.
-
-    train_scale: training size over the size in the files.
-    images: the folder of the photos.
-    test_every: every n-th view is a test view; 0 for no split.
-    undistort: straighten photographs whose lens distorts, and draw the pinhole that sees the same.
-    """
+    """The user's choices, see `read_cameras`; None means what the files say, or else the format's custom."""
 
     train_scale: float | None = None
     images: str | None = None

@@ -17,14 +17,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import look_at
-from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.cameras.camera_path import MAX_ANGLE, CameraPath
 from aaplug.io.cameras.keyframes import FPS, cameras_of, frame_times, hermite, rising, segments
 from aaplug.io.values import Entry, entries, mentions, number, numbers, object_of, read_json
 from aaplug.system.errors import UsageError
 
 WORLD = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)  # signs of the scene's axes in the viewer's world
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-MAX_ANGLE = 180.0  # degrees
 FOV = 60.0  # degrees, if nothing says
 
 

@@ -29,7 +29,19 @@ from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import PNG_SIGNATURE, image_size
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
-from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json, read_start, text
+from aaplug.io.values import (
+    Entry,
+    Place,
+    entries,
+    focal,
+    mentions,
+    number,
+    object_of,
+    pixels,
+    read_json,
+    read_start,
+    text,
+)
 from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
@@ -156,7 +168,7 @@ def _dataparser(path: Path) -> Dataparser | None:
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> list[bool] | None:
     """True for each frame that nerfstudio's lists of file names keep from training; None without lists."""
     lists, frames = dict[str, set[str]](), set(paths)
-    place = object_of(document, file, "lists of file names", "frames").place
+    place = Place(file, "lists of file names")
     for key in filter(document.__contains__, FILE_LISTS):
         listed = document[key]
         right = isinstance(listed, list) and all(isinstance(path, str) for path in listed)

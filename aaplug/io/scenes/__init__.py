@@ -134,8 +134,8 @@ def read_scene(
         drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number;
             without it they are an error when they are read.
         allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
-        spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them; "auto" is
-            the first, with the second as `Scene.other`.
+        spz_axes: of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write
+            them; "auto" is what the file states, or else the first, with the second as `Scene.other`.
         frames_apart: the frames of a scene in time were trained apart: no Gaussian of one is in another.
 
     Raises:
@@ -187,7 +187,8 @@ def write_scene(
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
-    overwrite: replace an existing file.  spz_axes, spz_version: see `SceneFileOptions`.
+    overwrite: replace an existing file.  spz_axes: see `read_scene`; "auto" is the specification's.
+    spz_version: 3 as older readers of .spz take it, or 4, which states its axes.
 
     Raises:
         OutputError: no writable format has this suffix, the format cannot hold the scene, or the path is the scene's

@@ -18,12 +18,7 @@ MAX_REASON = 200  # characters of a library's message
 
 @dataclass(frozen=True)
 class SceneFileOptions:
-    """The user's choices for reading and writing, of which each format uses those that concern it.
-
-    allow_checkpoint: open a .pt, a pickle, of which only tensors are read.
-    spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write,
-        or "auto": written by the specification, and read as the file says, or else as fits the cameras.
-    spz_version: of a .spz to write.
+    """The user's choices, see `read_scene` and `write_scene`, of which each format uses those that concern it.
 
     Raises:
         UsageError: there are no such axes, or no such version.
