@@ -74,10 +74,8 @@ def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iter
 
 
 @contextmanager
-def claimed(path: AnyPath, check: Callable[[], object] = lambda: None) -> Iterator[None]:
+def claimed(path: AnyPath) -> Iterator[None]:
     """Keep other processes from writing an output, a file or a folder, while the block runs.
-
-    check: refuses what must not be written.  It is called again here, as another process may have written meanwhile.
 
     Raises:
         OutputError: another process is writing it, or nothing can be written beside it.
@@ -93,7 +91,6 @@ def claimed(path: AnyPath, check: Callable[[], object] = lambda: None) -> Iterat
         except OSError as error:
             raise OutputError(path, f"cannot be written: {reason(error)}") from error
         stack.callback(mark.unlink, missing_ok=True)
-        check()
         yield
 
 
@@ -103,7 +100,7 @@ def writing(
 ) -> Iterator[None]:
     """Claim an output while the block writes it; None claims nothing.  Raises as `claimed` and `make_folder`.
 
-    check: refuses what must not be written.
+    check: refuses what must not be written; called once the output is claimed, as others may have written meanwhile.
     inputs: files that nothing in this process replaces before the outermost block ends.
     folder: the output is one.
     """
@@ -115,7 +112,8 @@ def writing(
         try:
             _inputs.update(_ids_of(inputs))
             stack.enter_context(output_folder(path if folder else Path(os.path.realpath(path)).parent))
-            stack.enter_context(claimed(path, check))
+            stack.enter_context(claimed(path))
+            check()
             yield
         finally:
             _open_outputs.remove(path)

@@ -203,9 +203,8 @@ def glb_start(document: dict[str, Any], binary: int, room: int = 0) -> bytes:
     data = json.dumps(document, separators=(",", ":")).encode()
     data += b" " * max(room - len(data), -len(data) % 4)
     size = HEADER.size + 2 * CHUNK.size + len(data) + binary
-    return (
-        HEADER.pack(MAGIC, VERSION, size) + CHUNK.pack(len(data), JSON_CHUNK) + data + CHUNK.pack(binary, BINARY_CHUNK)
-    )
+    chunk = CHUNK.pack(len(data), JSON_CHUNK) + data
+    return HEADER.pack(MAGIC, VERSION, size) + chunk + CHUNK.pack(binary, BINARY_CHUNK)
 
 
 def _chunks(path: Path) -> Iterator[tuple[int, Buffer]]:

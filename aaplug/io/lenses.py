@@ -88,9 +88,8 @@ def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None
 
 def _notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], undistort: bool) -> list[str]:
     """Notes on the panoramas and the lenses that distort, with the names of their models."""
-    pairs = [
-        (lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens and lens.name != PANORAMA
-    ]
+    both = zip(distortions, cameras, strict=True)
+    pairs = [(lens, camera) for lens, camera in both if lens and lens.name != PANORAMA]
     panoramas = distortions.count(Distortion(PANORAMA, EQUIRECT))
     notes = [f"{counted(panoramas, 'camera')} of 360° × 180° ({PANORAMA}), and so are the renders"] if panoramas else []
     if not pairs:

@@ -191,9 +191,8 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
                 formats.append(words)
             case ["element", name, count]:
                 if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
-                    raise FormatError(
-                        path, f"element {name!r} has the impossible count {count[:MAX_VALUE_CHARACTERS]!r}"
-                    )
+                    got = repr(count[:MAX_VALUE_CHARACTERS])
+                    raise FormatError(path, f"element {name!r} has the impossible count {got}")
                 tables.append((name, int(count), []))
             case ["property", kind, name] if tables and kind in CODES:
                 tables[-1][2].append(Property(name, CODES[kind]))

@@ -88,9 +88,8 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
         ends = count.cumsum(0)
         starts.append(below + ends - count)
         below += int(ends[-1])
-        order.append(
-            siblings[(firsts[order[-1]] - ends + count).repeat_interleave(count) + torch.arange(int(ends[-1]))]
-        )
+        first = (firsts[order[-1]] - ends + count).repeat_interleave(count)
+        order.append(siblings[first + torch.arange(len(first))])
     along = torch.cat(order)
     return Tree(scene[along], counts[along], torch.cat(starts) * counts[along].sign())
 

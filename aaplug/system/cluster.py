@@ -180,9 +180,8 @@ def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monito
 
 def _client(address: str) -> Client:
     if SCHEDULER_ADDRESS.fullmatch(address) is None:
-        raise UsageError(
-            "scheduler", f"takes local or an address such as tcp://host:8786, got {address[:MAX_VALUE_CHARACTERS]}"
-        )
+        got = address[:MAX_VALUE_CHARACTERS]
+        raise UsageError("scheduler", f"takes local or an address such as tcp://host:8786, got {got}")
     try:
         return Client(address, timeout=ANSWER_SECONDS, set_as_default=False)
     except OSError as error:

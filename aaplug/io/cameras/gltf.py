@@ -70,9 +70,8 @@ def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
     found: dict[int, dict[str, Channel]] = {}
     nodes = len(file.items("nodes"))
     for animation in file.items("animations"):
-        samplers = [
-            Entry(animation.place, e.fields) for e in entries(file.path, "sampler", animation.value("samplers"))
-        ]
+        listed = entries(file.path, "sampler", animation.value("samplers"))
+        samplers = [Entry(animation.place, each.fields) for each in listed]
         for channel in entries(file.path, "channel", animation.value("channels")):
             target = channel.entry("target")
             kind = target.fields.get("path")

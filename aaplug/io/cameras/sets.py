@@ -99,10 +99,9 @@ def photo_sizes(cameras: Sequence[Camera]) -> list[Size]:
     for camera in cameras:
         size = camera.photo and image_size(camera.photo)
         if size and abs(size[1] - (height := camera.height * size[0] / camera.width)) > 1 + MAX_ASPECT_ERROR * height:
-            what = (
-                f"is {size[0]}×{size[1]} px, which is not the shape of its camera ({camera.width}×{camera.height} px)"
-            )
-            raise FormatError(camera.photo or "", f"{what}; is it the wrong folder, or is the photo turned?")
+            what = f"is {size[0]}×{size[1]} px, which is not the shape of its camera"
+            hint = "is it the wrong folder, or is the photo turned?"
+            raise FormatError(camera.photo or "", f"{what} ({camera.width}×{camera.height} px); {hint}")
         sizes.append(size)
     rate = next((size[0] / camera.width for size, camera in zip(sizes, cameras, strict=True) if size), 1.0)
     return [size or _scaled(camera, rate) for size, camera in zip(sizes, cameras, strict=True)]

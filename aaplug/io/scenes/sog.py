@@ -161,11 +161,11 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
         palette = key == "shN" and index == 0
         noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
         images.append(_image(path, file, fetch, None if palette else count, noisy))
-    return Part(entry, [pixels for pixels, _ in images], images[0][1])
+    return Part(entry, [image.reshape(-1, BYTES_PER_PIXEL) for image in images], images[0].shape[1])
 
 
-def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> tuple[np.ndarray, int]:
-    """RGBA of a lossless WebP, a row per pixel, and its width; refuses more pixels than `count` Gaussians need."""
+def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> np.ndarray:
+    """RGBA of a lossless WebP, [height, width, 4]; refuses more pixels than `count` Gaussians need."""
     most = 2 * count + SPARE_PIXELS if count is not None else MAX_PALETTE_PIXELS
     data = fetch(file, BYTES_PER_PIXEL * most + whole_limit("SLACK"))
     if noisy:
@@ -175,7 +175,7 @@ def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) 
         width, height = image.size
         if width * height > most or width * height < (count or 1):
             raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
-        return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
+        return np.asarray(image.convert("RGBA"))
 
 
 def _meaning(meta: dict[str, Any]) -> Facts:

@@ -118,9 +118,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
 def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | None]:
     """A file's header, its sections with a row per Gaussian, and the axes that it states; or those of a part of it."""
     zipped = data.startswith(GZIP_SIGNATURE)
-    header = _header(
-        path, zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
-    )
+    head = zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
+    header = _header(path, head)
     sizes = [width * header.count for width in header.widths]
     if header.version >= STREAMS_VERSION:
         if zipped:
@@ -270,9 +269,8 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     if fraction < 1:
         raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
-    warn_of_moves(
-        path, name, [(part, (part.means * 2**fraction).round() / 2**fraction - part.means) for part in scenes]
-    )
+    moves = [(part.means * 2**fraction).round() / 2**fraction - part.means for part in scenes]
+    warn_of_moves(path, name, [*zip(scenes, moves, strict=True)])
     warn_of_sizes(path, name, scenes, MIN_LOG_SCALE, MIN_LOG_SCALE + 255 / SCALE_STEPS)
     sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
     flags = ANTIALIASED_FLAG * first.convention.compensated
