@@ -82,11 +82,6 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def sample_folder() -> Path:
-    return SAMPLE
-
-
-@pytest.fixture(scope="session")
 def sample_scene() -> Gaussians:
     return read_scene(SAMPLE / "chair.ply").gaussians()
 

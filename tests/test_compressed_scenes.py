@@ -32,7 +32,7 @@ from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE
-from tests.scene_files import DATA, MADE, half_turn_about_x, ksplat, oracle, splat, splats, write_file
+from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(
@@ -267,14 +267,6 @@ def test_a_format_that_is_not_written_says_which_are(tmp_path: Path, expected):
     for name in ("a.ksplat", "a.pt", "a"):
         with pytest.raises(OutputError, match=r"can be written: \.compressed\.ply, \.ply, \.spz, \.sog, \.splat"):
             write_scene(tmp_path / name, expected)
-
-
-def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
-    """Colours from turned directions are those before the turn."""
-    scene = oracle()
-    directions = torch.nn.functional.normalize(torch.randn(len(scene), 3), dim=1)
-    turned = directions * torch.tensor([1.0, -1.0, -1.0])
-    torch.testing.assert_close(sh_colour(half_turn_about_x(scene).sh, turned), sh_colour(scene.sh, directions))
 
 
 @pytest.mark.parametrize("name", WRITABLE)

@@ -84,13 +84,6 @@ def test_reading_a_written_png_gives_the_quantised_image(tmp_path: Path, bit_dep
     assert torch.equal(read_image(tmp_path / "codes.png", None), rgb), "every code survives"
 
 
-def test_colours_are_rgb_and_rows_run_down(tmp_path: Path):
-    rgb = torch.zeros(2, 3, 3)
-    rgb[0, 2] = torch.tensor([1.0, 0.5, 0.0])
-    write_png(tmp_path / "a.png", rgb)
-    assert Image.open(tmp_path / "a.png").getpixel((2, 0)) == (255, 128, 0)
-
-
 def test_alpha_is_composited_in_float(tmp_path: Path):
     path = save(tmp_path / "a.png", np.array([[[30, 20, 10, 51]]], np.uint8))  # BGRA
     got = read_image(path, (0.5, 0.25, 1.0))[0, 0]

@@ -17,7 +17,7 @@ from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
 from aaplug.verbs.render import render
-from tests.conftest import make_camera, make_scene, memory_taken, needs_peak_memory
+from tests.conftest import SAMPLE, make_camera, make_scene, memory_taken, needs_peak_memory
 
 VIEWS = (make_camera(), make_camera(eye=(0.3, -0.5, 0.2), name="inside"))
 COUNT = 200_000  # Gaussians: 48 MB of .ply
@@ -95,10 +95,10 @@ def test_gaussians_that_were_read_anyway_are_drawn(tmp_path: Path, monkeypatch: 
     assert without_harmonics(scene) == (scene.gaussians(), None)
 
 
-def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_folder: Path):
+def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def images(folder: str) -> list[torch.Tensor]:
-        chair, one = sample_folder / "chair.ply", {"views": "r_8", "scale": 1 / 16, "threads": 1}
-        return [read_image(file) for _, file in render(chair, sample_folder, tmp_path / folder, **one)]
+        chair, one = SAMPLE / "chair.ply", {"views": "r_8", "scale": 1 / 16, "threads": 1}
+        return [read_image(file) for _, file in render(chair, SAMPLE, tmp_path / folder, **one)]
 
     expected = images("held")
     monkeypatch.setattr("aaplug.io.scenes.scene.MAX_HARMONICS_BYTES", 0)

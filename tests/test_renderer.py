@@ -29,7 +29,7 @@ from aaplug.rendering import renderer as rendering
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FrameError, UsageError
-from tests.conftest import ROOT, make_camera, make_scene
+from tests.conftest import ROOT, SAMPLE, make_camera, make_scene
 
 EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
 
@@ -139,11 +139,11 @@ def test_autocast_changes_nothing(recipe, cameras):
         assert renderer(cameras[0].scaled(1 / 2)).rgb.equal(expected)
 
 
-def test_paths_are_read(sample_folder, sample_cameras):
-    scene, view = sample_folder / "chair.ply", sample_cameras.test[0].scaled(0.125)
+def test_paths_are_read(sample_cameras):
+    scene, view = SAMPLE / "chair.ply", sample_cameras.test[0].scaled(0.125)
     by_path, by_hand = (
         Renderer.of(*pair, rasterizer="eager")
-        for pair in ((scene, str(sample_folder)), (read_scene(scene), read_cameras(sample_folder)))
+        for pair in ((scene, str(SAMPLE)), (read_scene(scene), read_cameras(SAMPLE)))
     )
     assert by_path.recipe == by_hand.recipe
     assert by_path.background == by_hand.background

@@ -126,6 +126,7 @@ ROUND_TRIPS = {
     "lists before": File(before=(faces, face_rows)),
     "lists after": File(after=(faces, face_rows)),
     "empty lists": File(after=(faces, bytes(10))),
+    "any alphabet": plain("\x85 \xa0", "日本"),
     "CRLF": File(newline=b"\r\n", top=tagged),
     "long type names": plain(columns=[("float32", n) for _, n in File().columns]),
     "filter_3D": filtered("hello"),
@@ -140,7 +141,7 @@ def through(scene: Gaussians, folder: Path) -> bytes:
 
 
 def comments(content: bytes) -> list[str]:
-    lines = content.split(b"end_header")[0].decode().splitlines()
+    lines = content.split(b"end_header")[0].decode().split("\n")
     return [line.removeprefix("comment ") for line in lines if line.startswith("comment")]
 
 
@@ -190,32 +191,12 @@ def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data)
     assert (folder / "again.ply").read_bytes() == content
 
 
-def test_columns_go_where_inria_puts_them(tmp_path: Path):
-    file = plain(degree=2)
-    scene, rows = read_scene(file.save(tmp_path)).gaussians(), values(file.content, file)
-    sh = {"f_dc_2": (0, 2), "f_rest_0": (1, 0), "f_rest_7": (8, 0), "f_rest_8": (1, 1), "f_rest_18": (3, 2)}
-    columns = {"z": scene.means[:, 2], "rot_0": scene.quats[:, 0], "scale_1": scene.log_scales[:, 1]}
-    columns |= {"opacity": scene.logit_opacities} | {name: scene.sh[:, k, c] for name, (k, c) in sh.items()}
-    assert scene.sh.shape == (5, 9, 3)
-    assert {name: values.tolist() for name, values in columns.items()} == {n: rows[n].tolist() for n in columns}
-
-
 def test_a_scene_without_origin_has_inrias_columns(tmp_path: Path):
     header = through(random_scene(2, 1), tmp_path).split(b"end_header")[0].decode()
     names = re.findall(r"property float (\S+)\n", header)
     order = parameters(1)
     assert names == [*order[:3], "nx", "ny", "nz", *order[3:]]
     assert header.startswith("ply\nformat binary_little_endian 1.0\nelement vertex 2\n")
-
-
-def test_only_changed_columns_differ(tmp_path: Path):
-    file = File(columns=shuffled)
-    scene = read_scene(file.save(tmp_path)).gaussians()
-    scene = replace(scene, log_scales=scene.log_scales + torch.tensor([0.0, 1.0, 0.0]))
-    content = through(scene, tmp_path)
-    assert content.startswith(file.header)
-    old, new = values(file.content, file), values(content, file)
-    assert [n for n in old.dtype.names or () if (old[n] != new[n]).any()] == ["scale_1"]
 
 
 @pytest.mark.parametrize("index", [[], [4, 4, 0]])
@@ -260,13 +241,6 @@ def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):
     warned = [message for message in caplog.messages if "cannot hold" in message]
     assert warned == [f"{tmp_path / 'own.glb'}: the format cannot hold {lost}; a .ply can"]
     assert said == [f"own.ply: the merged scene does not have its {lost.removeprefix('the ')}"]
-
-
-def test_fewer_harmonics_drop_their_columns(tmp_path: Path):
-    scene = read_scene(plain(degree=2).save(tmp_path)).gaussians()
-    content = through(replace(scene, sh=scene.sh[:, :4]), tmp_path)
-    assert content.count(b"property float f_rest_") == 9
-    assert torch.equal(read_scene(tmp_path / "out.ply").gaussians().sh, scene.sh[:, :4])
 
 
 def test_large_scenes_are_copied_in_whole(tmp_path: Path):
@@ -359,7 +333,7 @@ def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
 @pytest.mark.parametrize(
     ("before", "convention", "after"),
     [
-        (["hi", "SplatRenderMode: default"], MIP, ["hi", "SplatRenderMode: mip"]),
+        (["\x85 日本", "SplatRenderMode: default"], MIP, ["\x85 日本", "SplatRenderMode: mip"]),
         (["antialiased 0", "splatrendermode: x"], MIP, ["SplatRenderMode: mip"]),
         (["antialiased 1", "hi"], CLASSIC, ["hi"]),
         (["SplatRenderMode: mip", "SplatRenderMode: mip"], MIP, None),
@@ -458,13 +432,6 @@ def test_2d_gaussians_are_discs(tmp_path: Path, file: File):
     )
     assert b"scale_2" not in through(replace(random_scene(3, 0), flat=True), tmp_path), "without an origin"
     assert read_scene(tmp_path / "out.ply").gaussians().flat
-
-
-def test_comments_of_any_alphabet_are_kept(tmp_path: Path):
-    for text in ("\x85 \xa0", "日本"):
-        scene = read_scene(plain(text).save(tmp_path)).gaussians()
-        assert through(scene, tmp_path) == plain(text).content
-        assert text.encode() in through(replace(scene, convention=MIP), tmp_path)
 
 
 @pytest.mark.parametrize("order", ["<", ">", "text"])

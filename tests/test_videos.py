@@ -66,16 +66,6 @@ def test_what_is_no_film_is_refused(tmp_path, values):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_video_that_fails_leaves_nothing(tmp_path):
-    def frames():
-        yield torch.zeros(8, 8, 3)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "v.webm", frames(), 25.0)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_what_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "there.webm").write_bytes(b"mine")
     frames = ramp(1, 8, 8)
