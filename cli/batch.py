@@ -40,7 +40,7 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
 
 def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
     """Evaluate every scene that a batch file or the command line names, or of a protocol's data set in a folder."""
-    from aaplug.evaluation.data_sets import check_whole, find_scenes
+    from aaplug.evaluation.data_sets import find_scenes
 
     if words.batch is not None:
         if others := words.more or words.scene or words.model_path:
@@ -48,10 +48,9 @@ def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
         scenes = scenes_of(words.batch, words.where(batch=None))
     elif of_set:
         data, protocol = path_of(words), str(words.protocol)
-        found = find_scenes(protocol, data, words.models)
-        check_whole(protocol, data, found, words.skip)
+        found = find_scenes(protocol, data, words.models, words.skip)
         words = words.where(more=(), model_path=None, models=None)
-        scenes = [(n, words.where(scene=model, cameras=data)) for n, (model, data) in found.scenes.items()]
+        scenes = [(n, words.where(scene=model, cameras=data)) for n, (model, data) in found.items()]
     else:
         paths = [path_of(words), *words.more]
         names = [path.stem if path.is_file() else path.name for path in paths]

@@ -62,13 +62,6 @@ def data_set_of(protocol: str) -> DataSet:
     return DATA_SETS[protocol]
 
 
-class Found(NamedTuple):
-    """Scenes of a data set: by name the trained scene and the folder of its data; and what is missing, in words."""
-
-    scenes: Mapping[str, tuple[Path, Path]]
-    missing: Mapping[str, str]
-
-
 def _places(data_set: DataSet, root: Path, scene: str) -> Iterator[Path]:
     """Folders where a scene may lie."""
     for folder in (root, *(root / name for name in data_set.folders)):
@@ -81,18 +74,21 @@ def is_set(protocol: str, folder: Path) -> bool:
     return known is not None and any(each.is_dir() for s in known.scenes for each in _places(known, folder, s))
 
 
-def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
-    """Find every scene of a protocol's data set by its layout.
+def find_scenes(
+    protocol: str, data: Path, models: Path | None = None, skip: bool = False
+) -> dict[str, tuple[Path, Path]]:
+    """Every scene of a protocol's data set, found by its layout: by name the trained scene and the folder of its data.
 
     Data lies in SCENE or SET/SCENE.  A trained scene is an INRIA model or SCENE.ply in SCENE, SET/SCENE, or checkpoint
     in these.
 
     models: folder of the trained scenes; None if they lie with the data.
+    skip: leave out scenes that are missing, unless all are.
 
-    Raises UsageError if the protocol is not one of a data set.
+    Raises UsageError if the protocol is not one of a data set, and FormatError if scenes are missing.
     """
     data_set, root = data_set_of(protocol), models or data
-    scenes, missing = dict[str, tuple[Path, Path]](), dict[str, str]()
+    scenes, missing = dict[str, tuple[Path, Path]](), list[str]()
     for scene in data_set.scenes:
         cameras = [place for place in _places(data_set, data, scene) if (place / data_set.cameras).exists()]
         places = [place for place in _places(data_set, root, scene) if place.is_dir()]
@@ -103,17 +99,11 @@ def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
             continue
         problems = [] if cameras else [f"no {data_set.cameras} in {data / scene}"]
         problems += [] if trained else [f"no {MODEL_SCENE.replace('*', 'N')} and no {scene}.ply in {root / scene}"]
-        missing[scene] = ", ".join(problems)
-    return Found(scenes, missing)
-
-
-def check_whole(protocol: str, data: Path, found: Found, skip: bool) -> None:
-    """Refuse a set of which scenes are missing, unless they are to be left out; or of which all are."""
-    data_set = DATA_SETS[protocol]
-    if found.missing and not (skip and found.scenes):
-        what = "; ".join(f"{scene}: {why}" for scene, why in found.missing.items())
-        count = f"{len(found.missing)} of the {len(data_set.scenes)} scenes of {data_set.title}"
-        raise FormatError(data, f"lacks {count} (`skip` leaves them out): {what}")
+        missing.append(f"{scene}: {', '.join(problems)}")
+    if missing and not (skip and scenes):
+        count = f"{len(missing)} of the {len(data_set.scenes)} scenes of {data_set.title}"
+        raise FormatError(data, f"lacks {count} (`skip` leaves them out): {'; '.join(missing)}")
+    return scenes
 
 
 class Paper(NamedTuple):
