@@ -490,7 +490,7 @@ def viewers(words: Words) -> Answer:
 
     headings = ("--for", "adds; where a splat ends", "program, what to choose there, and how the rule is known")
     all_of = VIEWERS.values()
-    rows = [(v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in all_of]
+    rows = [(v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.choice}") for v in all_of]
     return Answer([asdict(viewer) for viewer in all_of], [table(rows, headings)])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aaplug.io.scenes import SCENE_FORMATS
-from aaplug.methods.viewers import VIEWERS, Viewer
+from aaplug.methods.viewers import MOST_DEGREE, VIEWERS, Viewer
 from tests.conftest import ROOT
 
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "examples").rglob("*.md"))]
@@ -66,8 +66,18 @@ def test_every_format_has_a_row():
 
 def row_of(viewer: Viewer) -> str:
     """A viewer's row of the table in viewers.md."""
-    name, *cells = viewer.row().values()
-    return f"| `{name}` | {' | '.join(cells)} |"
+    assert viewer.convention is not None
+    cells = [
+        viewer.program,
+        viewer.choice,
+        f"{viewer.convention.kernel:g} px²",
+        "yes" if viewer.convention.compensated else "no",
+        "any" if viewer.sh_degree == MOST_DEGREE else str(viewer.sh_degree),
+        viewer.end,
+        viewer.levels or "none",
+        viewer.evidence,
+    ]
+    return f"| `{viewer.name}` | {' | '.join(cells)} |"
 
 
 @pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)

@@ -89,20 +89,10 @@ class Viewer:
         ends += [f"variances at least {2 * self.apart:.2g} px² apart"] if self.apart else []
         return "; ".join(ends) or "nowhere"
 
-    def row(self) -> dict[str, str]:
-        """The rule by headings, in words."""
-        assert self.convention is not None
-        return {
-            "--for": self.name,
-            "program": self.program,
-            "settings": f"anti-aliasing on: {self.settings}" if self.switched else self.settings,
-            "adds": f"{self.convention.kernel:g} px²",
-            "compensated": "yes" if self.convention.compensated else "no",
-            "SH": "any" if self.sh_degree == MOST_DEGREE else str(self.sh_degree),
-            "a splat ends at": self.end,
-            "levels by": self.levels or "none",
-            "known": self.evidence,
-        }
+    @property
+    def choice(self) -> str:
+        """The settings, after the switch that they need."""
+        return f"anti-aliasing on: {self.settings}" if self.switched else self.settings
 
     def advice(self, suffix: str, file: str) -> str:
         """One line on the settings to choose in the program for a file, of such a format, that was converted for it."""
@@ -119,7 +109,7 @@ class Viewer:
         if not self.switched:
             return f"in {self.program}, choose {self.settings}"
         without = "with it off, a converted scene can look worse than the original"
-        return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
+        return f"in {self.program}, turn {self.choice} ({without})"
 
     def spz(self, asked: SpzAxes) -> "dict[str, Any]":
         """How a .spz is written, for `write_scene`: axes as asked for, or the program's own, and its version."""
