@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import check_frame, sampling_bounds
 from aaplug.evaluation.coverage import log_multiples
 from aaplug.io.scenes.scene import Scene
@@ -55,7 +54,6 @@ class Survey:
     largest: log-scale.  filtered: true if a 3D filter is stored.  faults: unusable rows by their fault.
     """
 
-    cameras: Sequence[Camera] = ()
     count: int = 0
     seen: int = 0
     under: int = 0
@@ -70,37 +68,31 @@ class Survey:
     filtered: bool = False
     faults: dict[str, int] = field(default_factory=dict)
 
-    def add(self, part: Gaussians) -> None:
-        """Count a part of the scene."""
-        self.filtered |= part.filter_3d is not None
-        if not len(part):
-            return
-        self.count += len(part)
-        low, high = part.means.aminmax(dim=0)
-        self.low, self.high = torch.minimum(self.low, low), torch.maximum(self.high, high)
-        self.largest = max(self.largest, part.log_scales.max().item())
-        _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
-        self.needles += int((long - broad > math.log(NEEDLE_RATIO)).sum())
-        self.above_zero += int((part.log_scales > 0).all(dim=1).sum())
-        logits = part.logit_opacities
-        self.activated += int(((logits >= 0) & (logits <= 1)).sum())
-        if not self.cameras:
-            return
-        bounds = sampling_bounds(part.means, self.cameras)
-        self.seen += int(bounds.seen.sum())
-        self.rates.add(bounds.highest[bounds.seen].log())
-        multiples = log_multiples(part, bounds)
-        self.multiples.add(multiples)
-        self.under += int((multiples < 0).sum())
-
 
 def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
     """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
-    statistics = Survey(cameras)
-    for part in opened.parts(faults=statistics.faults):
-        statistics.add(part)
-        tell(statistics.count, max(1, opened.count))
-    return statistics
+    found = Survey()
+    for part in opened.parts(faults=found.faults):
+        found.filtered |= part.filter_3d is not None
+        if not len(part):
+            continue
+        found.count += len(part)
+        low, high = part.means.aminmax(dim=0)
+        found.low, found.high = torch.minimum(found.low, low), torch.maximum(found.high, high)
+        found.largest = max(found.largest, part.log_scales.max().item())
+        _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
+        found.needles += int((long - broad > math.log(NEEDLE_RATIO)).sum())
+        found.above_zero += int((part.log_scales > 0).all(dim=1).sum())
+        found.activated += int(((part.logit_opacities >= 0) & (part.logit_opacities <= 1)).sum())
+        if cameras:
+            bounds = sampling_bounds(part.means, cameras)
+            found.seen += int(bounds.seen.sum())
+            found.rates.add(bounds.highest[bounds.seen].log())
+            multiples = log_multiples(part, bounds)
+            found.multiples.add(multiples)
+            found.under += int((multiples < 0).sum())
+        tell(found.count, opened.count)
+    return found
 
 
 def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:

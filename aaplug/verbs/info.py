@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import CameraSet
 from aaplug.core.orbits import Frame
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import above_nyquist, aliasing_begins
@@ -63,8 +63,7 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         frame = frame_around(opened, orbit)
         sampling = _assumed_facts(statistics, job.cameras, frame, up_evidence(opened, orbit, frame))
     else:
-        sampling = _sampling_facts(statistics, job.cameras, opened.convention.kernel) if train else {}
-        sampling |= _spectrum_facts(opened, train) if train else {}
+        sampling = _sampling_facts(opened, statistics, job.cameras) if train else {}
     comments = opened.document.header.comments if isinstance(opened.document, Document) else []
     problems = list(_problems(opened, statistics, comments))
     return _scene_facts(opened, statistics, comments) | sampling | {"problems": problems}
@@ -94,25 +93,23 @@ def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> d
     }
 
 
-def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:
+def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dict[str, Any]:
     rate, multiple = statistics.rates.quantile(0.5), statistics.multiples.quantile(0.5)
+    begins = None if multiple is None else aliasing_begins(math.exp(multiple), scene.convention.kernel)
+    train, above = cameras.train, dict[str, dict[str, float | None]]()
+    some = scene.sample(SPECTRUM_ROWS)
+    for name in SPECTRUM_RECIPES:
+        renderer = Renderer.of(some, TrainingViews.of(some, train), name)
+        above[name] = {f"at {scale_name(scale)}": above_nyquist(renderer, train, scale) for scale in SPECTRUM_SCALES}
     return {
-        "training_cameras": len(cameras.train),
+        "training_cameras": len(train),
         "seen_share": statistics.seen / max(1, statistics.count),
         "median_rate_px_per_unit": None if rate is None else math.exp(rate),
         "under_sampling_bound_share": statistics.under / max(1, statistics.seen),
-        "aliasing_begins_at_scale": None if multiple is None else aliasing_begins(math.exp(multiple), kernel),
+        "aliasing_begins_at_scale": begins,
         "cameras": list(cameras.notes),
+        "energy_above_nyquist_share": {n: found for n, found in above.items() if None not in found.values()},
     }
-
-
-def _spectrum_facts(scene: Scene, train: Sequence[Camera]) -> dict[str, Any]:
-    """Share of the splats' energy above the Nyquist rate, by recipe and scale, from Gaussians of all over the file."""
-    some = scene.sample(SPECTRUM_ROWS)
-    renderers = {name: Renderer.of(some, TrainingViews.of(some, train), name) for name in SPECTRUM_RECIPES}
-    at = {f"at {scale_name(scale)}": scale for scale in SPECTRUM_SCALES}
-    shares = {n: {name: above_nyquist(r, train, scale) for name, scale in at.items()} for n, r in renderers.items()}
-    return {"energy_above_nyquist_share": {n: found for n, found in shares.items() if None not in found.values()}}
 
 
 def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame, evidence: str) -> dict[str, Any]:
