@@ -323,7 +323,12 @@ class Renderer:
             image = self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
             if plug_ins:
                 check_answer(f"rasterizer {self.rasterizer.name}", image, Render)
-                _check_image(image, splats, hw)
+                expected = {"rgb": [*hw, splats.rgb.shape[1] if splats.rgb is not None else 0], "alpha": [*hw]}
+                for name, value in image._asdict().items():
+                    if [*value.shape] != expected[name]:
+                        raise UsageError(name, f"expected {expected[name]}, got {[*value.shape]}")
+                    if not value.isfinite().all():
+                        raise UsageError(name, "expected finite numbers, got some that are NaN or infinite")
         return image
 
     def recipe_through(self, camera: Camera | None) -> Recipe:
@@ -487,16 +492,6 @@ def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaus
     """
     scene = fuse_stored(scene)
     return scene if recipe.world is None else filtered("world filter", recipe.world, scene, training)
-
-
-def _check_image(image: Render, splats: Splats2D, hw: tuple[int, int]) -> None:
-    """Raise UsageError for what is no image of the splats."""
-    expected = {"rgb": [*hw, splats.rgb.shape[1] if splats.rgb is not None else 0], "alpha": [*hw]}
-    for name, value in image._asdict().items():
-        if [*value.shape] != expected[name]:
-            raise UsageError(name, f"expected {expected[name]}, got {[*value.shape]}")
-        if not value.isfinite().all():
-            raise UsageError(name, "expected finite numbers, got some that are NaN or infinite")
 
 
 def own_look(
