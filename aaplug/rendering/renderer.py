@@ -209,8 +209,10 @@ class Renderer:
         return self._open[frame]
 
     @contract
+    @in_full_precision()
+    @on_free_cores()
     def __call__(self, camera: Camera) -> Render:
-        """Render one view: rgb and alpha of `camera.hw`.
+        """Render one view: rgb and alpha of `camera.hw`; with an exposure, the mean of its frames.
 
         Differentiable in every parameter of the scene and in `camera.cam_from_world`.
 
@@ -218,20 +220,17 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            return self.draw(camera).render if camera.exposure is None else self.at(camera.frame).exposed(camera)
-
-    @contract
-    @in_full_precision()
-    @on_free_cores()
-    def exposed(self, camera: Camera) -> Render:
-        """Render one view with its exposure: the mean of its frames."""
-        count, samples = self.frames(camera)
-        weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
-        fine = self._fine(camera, samples)
-        frames = (self.paint(self.splats(each, samples), fine.hw) for each in sample_cameras(fine))
-        pixels = (average_samples(frame, samples, weight) for frame in frames)
-        rgb, alpha = reduce(lambda total, frame: Render(*map(torch.add, total, frame)), pixels)
-        return Render(rgb / count, alpha / count)
+            if (now := self.at(camera.frame)) is not self:
+                return now(camera)
+            if camera.exposure is None:
+                return self.draw(camera).render
+            count, samples = self.frames(camera)
+            weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
+            fine = self._fine(camera, samples)
+            frames = (self.paint(self.splats(each, samples), fine.hw) for each in sample_cameras(fine))
+            pixels = (average_samples(frame, samples, weight) for frame in frames)
+            rgb, alpha = reduce(lambda total, frame: Render(*map(torch.add, total, frame)), pixels)
+            return Render(rgb / count, alpha / count)
 
     @contract
     @in_full_precision()
@@ -281,11 +280,10 @@ class Renderer:
             image = self(camera)._asdict()
             return {name: image[name] for name in names}
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            exposed = None if camera.exposure is None else self.exposed(camera)
+            exposed = None if camera.exposure is None else self(camera)
             camera = replace(camera, exposure=None)
             render, splats, hw = self.draw(camera)
-            rgb, alpha = exposed or render
-            found: dict[str, Tensor] = {"rgb": rgb, "alpha": alpha}
+            found: dict[str, Tensor] = (exposed or render)._asdict()
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
             recipe = self.recipe_through(splats.camera)
             per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
