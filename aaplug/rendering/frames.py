@@ -5,10 +5,9 @@ wait for each other; Python threads gained nothing.  An image does not depend on
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -47,27 +46,15 @@ def write_frames(
     photos = photographs(views)
     for path in files:
         check_output(path, overwrite, photos)
-    write = _Writer(renderer, tuple(views), files, storage)
+    anywhere = [path.absolute() for path in files]  # wherever the process runs that writes it
+    write = partial(_write, renderer.portable(), tuple(views), anywhere, storage)
     tell(0, total)
     for done, _ in enumerate(apply(write, range(total)), start=1):
         tell(done, total)
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Writes the view of an index; again, if its first writer died."""
-
-    renderer: Renderer
-    views: Sequence[Camera]
-    paths: Sequence[Path]
-    storage: Storage
-
-    @torch.no_grad()
-    def __call__(self, index: int) -> None:
-        layers = self.renderer.passes(self.views[index], self.storage.passes, self.storage.normal_axes)
-        write_layers(self.paths[index], layers, self.storage, overwrite=True)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """For another process, wherever it runs."""
-        paths = [path.absolute() for path in self.paths]
-        return self.__dict__ | {"renderer": self.renderer.portable(), "paths": paths}
+@torch.no_grad()
+def _write(renderer: Renderer, views: Sequence[Camera], paths: Sequence[Path], storage: Storage, index: int) -> None:
+    """Write the view of an index; again, if its first writer died."""
+    layers = renderer.passes(views[index], storage.passes, storage.normal_axes)
+    write_layers(paths[index], layers, storage, overwrite=True)

@@ -186,7 +186,9 @@ class Renderer:
         if origin is not None:  # rows stay where some of the file were dropped
             whole = torch.equal(origin.rows, torch.arange(len(origin.rows)))
             origin = None if whole else replace(origin, document=None)
-        return replace(self, scene=replace(self.scene, origin=origin), source=None)
+        same = replace(self, scene=replace(self.scene, origin=origin), source=None)
+        same._rates.update(self._rates)
+        return same
 
     @contract
     def at(self, frame: int) -> "Renderer":
