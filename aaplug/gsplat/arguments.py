@@ -88,7 +88,6 @@ class Options:
     radius_clip: float
     eps2d: float
     sh_degree: int | None
-    packed: bool
     tile_size: int
     render_mode: str
     rasterize_mode: str

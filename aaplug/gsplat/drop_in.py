@@ -129,7 +129,7 @@ def rasterization(
             takes what "compiled" was asked for.
     """
     options = Options(
-        *(width, height, near_plane, far_plane, radius_clip, eps2d, None if colors is None else sh_degree, packed),
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, None if colors is None else sh_degree),
         *(tile_size or 16, render_mode, rasterize_mode, trained_mode, max_alpha, global_z_order, camera_model),
     )
     refuse({"sparse_grad": sparse_grad, "distributed": distributed, "with_eval3d": with_eval3d, **others})

@@ -86,7 +86,7 @@ def rasterization_2dgs(
         raise UsageError("depth_mode", not_one_of(depth_mode, DEPTH_MODES))
     refuse({"sparse_grad": sparse_grad, "absgrad": absgrad, **others})
     options = Options(
-        *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size or 16, render_mode),
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size or 16, render_mode),
         *("classic", "classic", max_alpha),
     )
     views = views_of(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, None, None, options)
