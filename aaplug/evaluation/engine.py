@@ -29,8 +29,7 @@ from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
-from aaplug.io.scenes import SceneLike, scene_of
-from aaplug.methods.presets import suited
+from aaplug.io.scenes import SceneLike
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.cost import COMPARED, Cost, cost_of
 from aaplug.rendering.renderer import Renderer
@@ -60,10 +59,10 @@ def candidates_of(
     rasterizer: str | Rasterizer = "auto",
     background: Background = "auto",
 ) -> list[Candidate]:
-    """One scene by several recipes; those with the same world filter share the filtered scene."""
+    """One scene by several recipes that suit it; those with the same world filter share the filtered scene."""
     renderers: dict[tuple[WorldFilter | None, bool], Renderer] = {}
-    candidates, scene = [], scene_of(scene)
-    for recipe in (suited(recipe, scene.gaussians()) for recipe in recipes):
+    candidates = []
+    for recipe in recipes:
         key = recipe.world, recipe.levels is not None
         if key not in renderers:
             renderers[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
