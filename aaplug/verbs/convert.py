@@ -96,19 +96,20 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
 
     check()
     with running(options, path, check, job.inputs, folder=frames is not None) as workers:
-        if frames is not None and isinstance(rule, Form):
-            return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
-        if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
-            _write_in_parts(job, rule, path, workers.threads, files)
-            return Converted(job.scene.count, None, viewer)
-        if isinstance(rule, Form):
-            fused, report = _closed_form(job, rule), None
-        else:
+        report = None
+        if isinstance(rule, Viewer):
             gaussians = job.scene.gaussians()
-            steps = steps_for(gaussians, viewer) if options.steps is None else options.steps
+            steps = steps_for(gaussians, rule) if options.steps is None else options.steps
             look = job.look(steps, gradients=True)
             job.say_assumed(look)
-            fused, report = fit(gaussians, viewer, look, job.views, steps, job.monitor)
+            fused, report = fit(gaussians, rule, look, job.views, steps, job.monitor)
+        elif frames is not None:
+            return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
+        elif path and job.scene.path and job.scene.count > LARGE_SCENE:
+            _write_in_parts(job, rule, path, workers.threads, files)
+            return Converted(job.scene.count, None, viewer)
+        else:
+            fused = _closed_form(job, rule)
         if path is not None:
             write_scene(path, fused, **files)
     return Converted(len(fused), fused, viewer, report)
