@@ -29,7 +29,7 @@ from aaplug.evaluation.results import (
     scale_name,
     tables,
 )
-from aaplug.evaluation.truth import CACHE_DTYPE, Truth, back_projected
+from aaplug.evaluation.truth import CACHE_DTYPE, Truth, ViewTruth, back_projected
 from aaplug.io.images import read_image, write_png
 from aaplug.methods import RECIPES
 from aaplug.methods.presets import find_recipe
@@ -320,17 +320,18 @@ def test_a_cached_truth_is_made_once_and_lies_with_others_in_memory(look, views)
     views = [*views, replace(views[1], name=views[0].name)]  # a namesake, as in Blender's splits
     truth = Truth(look, memory=1e9)
     images = [truth(view, scale) for view in views[:2] for scale in (0.5, 0.25)]
-    cached = list(truth._cache.values())
+    cached = list(truth.cache.values())
     for image, stored in zip(images, cached, strict=True):
         torch.testing.assert_close(image, stored.float(), rtol=0, atol=0)
     assert len({image.untyped_storage().data_ptr() for image in cached}) == 1
     assert truth(views[2], 0.25).equal(images[3])
-    assert len(truth._cache) == 4
+    assert len(truth.cache) == 4
     assert images[1].equal(Truth(look)(views[0], 0.25).to(CACHE_DTYPE).float())
 
 
-def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, views):
+def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, views, monkeypatch):
     view, truth = views[0], Truth(look, memory=1e9)
+    monkeypatch.setattr(ViewTruth, "_image", lambda made, _: torch.full((1, 1, 3), float(made.view is not view)))
     pose = view.cam_from_world.clone()
     pose[0, 3] += 1
     bent = Undistortion(EQUIDISTANT, view.hw, (1.0,) * 4, (0, 0, *view.hw))
@@ -339,9 +340,8 @@ def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, vi
     for field in fields(Camera):
         value = getattr(view, field.name)
         other = replace(view, **{field.name: others[field.name] if field.name in others else type(value)(value + 1)})
-        truth.cached(view, 1.0, lambda: torch.zeros(1, 1, 3))
-        image = truth.cached(other, 1.0, lambda: torch.ones(1, 1, 3))
-        assert bool(image.any()) == (field.name != "name"), field.name
+        truth(view, 1.0)
+        assert bool(truth(other, 1.0).any()) == (field.name != "name"), field.name
 
 
 @pytest.mark.parametrize("room", [0, 1])
@@ -349,7 +349,7 @@ def test_a_full_memory_caches_nothing_more(look, views, room):
     bytes_of_one = look(views[0].scaled(0.5)).rgb.to(CACHE_DTYPE).nbytes
     truth = Truth(look, memory=float(room * bytes_of_one))
     first, second = (truth(view, 0.5) for view in views)
-    assert len(truth._cache) == room
+    assert len(truth.cache) == room
     assert truth(views[0], 0.5).equal(first)
     assert not truth(views[1], 0.5).equal(first)
     assert truth(views[1], 0.5).equal(second)

@@ -83,8 +83,8 @@ class Truth:
     protocol: Protocol = PROTOCOLS["default"]
     enlarge: Enlarge | None = None
     memory: float | None = None
-    _cache: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
-    _slab: list[Tensor] = field(default_factory=list, init=False, repr=False)  # the unused end of the last one
+    cache: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+    slab: list[Tensor] = field(default_factory=list, init=False, repr=False)  # of the cache: the last one's unused end
 
     def __call__(self, view: Camera, scale: float) -> Image:
         """Ground truth of `view` (given at the training size) at `scale`; it must be defined there."""
@@ -101,27 +101,6 @@ class Truth:
         """The renderer of a view that a protocol moves, with samples as dense as training's pixels."""
         samples = max(1, math.ceil(1 / scale))
         return replace(self.renderer, recipe=replace(self.renderer.recipe, grid=samples))
-
-    def cached(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
-        """The cached image, or a new one, cached while there is room."""
-        if self.memory is None:
-            return make()
-        pose = view.cam_from_world.detach().cpu().numpy().tobytes()
-        key = scale, *(vars(view) | {"cam_from_world": pose, "name": None}).values()  # names recur in other splits
-        if key in self._cache:
-            return self._cache[key].float()
-        new = make()
-        if new is None:
-            return None
-        image = new.to(CACHE_DTYPE)
-        if sum(cached.nbytes for cached in self._cache.values()) + image.nbytes <= self.memory:
-            # in a slab: small blocks that stay, between large ones that go, would keep those from the system
-            size = image.numel()
-            if not self._slab or len(self._slab[0]) < size:
-                self._slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
-            place, self._slab[0] = self._slab[0].split([size, len(self._slab[0]) - size])
-            self._cache[key] = place.view(image.shape).copy_(image)
-        return image.float()
 
 
 class ViewTruth:
@@ -143,8 +122,26 @@ class ViewTruth:
         return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
-        """The truth at a scale, before rounding; None where there is none."""
-        return self.truth.cached(self.view, scale, lambda: self._image(scale))
+        """The truth at a scale, before rounding; None where there is none.  It is cached while there is room."""
+        truth, view = self.truth, self.view
+        if truth.memory is None:
+            return self._image(scale)
+        pose = view.cam_from_world.detach().cpu().numpy().tobytes()
+        key = scale, *(vars(view) | {"cam_from_world": pose, "name": None}).values()  # names recur in other splits
+        if key in truth.cache:
+            return truth.cache[key].float()
+        new = self._image(scale)
+        if new is None:
+            return None
+        image = new.to(CACHE_DTYPE)
+        if sum(cached.nbytes for cached in truth.cache.values()) + image.nbytes <= truth.memory:
+            # in a slab: small blocks that stay, between large ones that go, would keep those from the system
+            size = image.numel()
+            if not truth.slab or len(truth.slab[0]) < size:
+                truth.slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
+            place, truth.slab[0] = truth.slab[0].split([size, len(truth.slab[0]) - size])
+            truth.cache[key] = place.view(image.shape).copy_(image)
+        return image.float()
 
     def _image(self, scale: float) -> Image | None:
         truth, camera = self.truth, self.camera(scale)
