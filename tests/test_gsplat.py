@@ -894,7 +894,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "colors: expected colours for render_mode RGB, got None": {"colors": None},
     "masks: expected shape [2, 28, 40], got [2, 4, 5]": {"masks": torch.ones(2, 4, 5, dtype=torch.bool)},
     "heliocentric: is not an argument of this function of gsplat's": {"heliocentric": 1},
-    "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
+    "rasterizer: 'cuda' is not one of auto, compiled, eager, reference": {"rasterizer": "cuda"},
 }
 
 
@@ -903,7 +903,7 @@ WRONG_FOR_DISCS = {
     "absgrad: only False is supported": {"absgrad": True},
     "quats: expected a tensor": {"quats": None},
     "covars: is not an argument": {"covars": torch.zeros(40, 3, 3)},
-    "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
+    "rasterizer: 'cuda' is not one of auto, compiled, eager, reference": {"rasterizer": "cuda"},
 }
 WRONG_CALLS = [(rasterization, *item) for item in WRONG.items()]
 WRONG_CALLS += [(rasterization_2dgs, *item) for item in WRONG_FOR_DISCS.items()]
