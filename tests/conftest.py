@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from aaplug.io.images import write_png
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.lab.learned import NAMES
 from aaplug.lab.pixel_size import PixelSizes
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled, on_demand
 from aaplug.rasterizers.tiled.ahead_of_time import load
@@ -72,6 +74,9 @@ def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
 def each(entries: Mapping[str, Any]) -> Any:
     """A fixture that is each of these in turn, by name."""
     return pytest.fixture(params=entries.values(), ids=entries)(lambda request: request.param)
+
+
+rasterize = each({name: partial(rasterizer, pixel=POINT) for name, rasterizer in ALL_RASTERIZERS.items()})
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from torch.optim import Optimizer
 
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import CLASSIC
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
@@ -49,9 +50,11 @@ EYES = ((0.3, -3.0, 0.4), (2.5, -1.0, -0.5))
 def gaussians(n: int = 40, dtype: torch.dtype = F64, degree: int | None = None, seed: int = 0) -> dict[str, Tensor]:
     """Arguments of a random scene; three channels, or harmonics."""
     scene = make_scene(n, seed, dtype, degree or 0)
-    colors = scene.sh[:, 0] + 0.7 if degree is None else scene.sh
-    values = (scene.means, scene.quats, scene.scales, scene.opacities, colors)
-    return dict(zip(INPUTS, values, strict=False))
+    return arguments(scene) | ({"colors": scene.sh[:, 0] + 0.7} if degree is None else {})
+
+
+def arguments(scene: Gaussians) -> dict[str, Tensor]:
+    return dict(zip(INPUTS, (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh), strict=False))
 
 
 def cameras(views: list[Camera], dtype: torch.dtype = F64) -> dict[str, object]:
@@ -73,6 +76,19 @@ class Nothing:
 
 def two_views(dtype: torch.dtype = F64) -> dict[str, object]:
     return cameras([make_camera(eye, SIZE) for eye in EYES], dtype)
+
+
+def small_views(*eyes: tuple[float, float, float]) -> dict[str, object]:
+    """Cameras whose gradients are soon found by differences, with oblong pixels."""
+    views = [make_camera(eye, (8, 6)) for eye in eyes]
+    return cameras([replace(view, fy=1.07 * view.fx) for view in views])
+
+
+def has_gradients(draw: Callable[..., object], leaves: dict[str, Tensor]) -> bool:
+    """True if those in arguments that are named are finite differences."""
+    inputs = [x.clone().requires_grad_() for x in leaves.values()]
+    how = {"eps": 1e-7, "rtol": 1e-4, "atol": 1e-4, "fast_mode": True}
+    return torch.autograd.gradcheck(lambda *args: draw(**dict(zip(leaves, args, strict=True))), inputs, **how)
 
 
 def unusual_views(count: int, dtype: torch.dtype = F64) -> dict[str, object]:
@@ -280,8 +296,7 @@ def test_backgrounds_show_through():
 def test_harmonics_and_rules_are_those_of_the_renderer(degree):
     scene, views = make_scene(200, degree=3, dtype=F64), [make_camera(eye, SIZE) for eye in EYES]
     scene = replace(scene, convention=replace(CLASSIC, rules=RULES_GSPLAT))
-    values = dict(zip(INPUTS, (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh), strict=False))
-    images, alphas, _ = rasterization(**values, **cameras(views), sh_degree=degree)
+    images, alphas, _ = rasterization(**arguments(scene), **cameras(views), sh_degree=degree)
     shown = replace(scene, sh=scene.sh[:, : (degree + 1) ** 2])
     renderer = Renderer.of(shown, views, "classic", rasterizer="eager")
     for view, image, alpha in zip(views, images, alphas, strict=True):
@@ -298,7 +313,7 @@ def test_matched_draws_as_the_recipe_at_the_given_rate(trained_mode, rate):
     scene, small = replace(scene, convention=convention), view.scaled(rate)
     recipe = replace(RECIPES["matched"], screen=Matched("global"))
     expected = Renderer.of(scene, [view], recipe, rasterizer="eager")(small).rgb
-    values = dict(zip(INPUTS, (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh), strict=False))
+    values = arguments(scene)
     words = {"sh_degree": 1, "rasterize_mode": "matched", "trained_mode": trained_mode}
     image, _, _ = rasterization(**values, **cameras([small]), **words, relative_rate=rate)
     torch.testing.assert_close(image[0], expected, rtol=0, atol=1e-9)
@@ -410,19 +425,16 @@ def test_normals_of_a_depth_image_are_those_of_its_plane():
 
 @pytest.mark.parametrize("depth_mode", ["expected", "median"])
 def test_gradients_of_discs_equal_finite_differences(depth_mode):
-    values, views = discs(8) | {"backgrounds": torch.rand(1, 3, dtype=F64)}, cameras([make_camera(EYES[0], SIZE)])
-    views |= {"width": 8, "height": 6}
-    views["Ks"] = views["Ks"] * torch.tensor([8 / SIZE[0], 6 / SIZE[1], 1], dtype=F64)[:, None]
+    values, views = discs(8) | {"backgrounds": torch.rand(1, 3, dtype=F64)}, small_views(EYES[0])
     leaves = values | {"viewmats": views.pop("viewmats")}
 
-    def draw(*args: Tensor) -> Tensor:
+    def draw(**given: Tensor) -> Tensor:
         words = {"render_mode": "RGB+ED", "distloss": True, "depth_mode": depth_mode}
-        *results, _ = rasterization_2dgs(**dict(zip(leaves, args, strict=True)), **views, **words)
+        *results, _ = rasterization_2dgs(**given, **views, **words)
         assert results[3].shape == (6, 8, 3), "gsplat leaves out the dimension of one camera"
         return torch.cat([x.view(6, 8, -1) for x in results], dim=2)
 
-    inputs = [x.clone().requires_grad_() for x in leaves.values()]
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, rtol=1e-4, atol=1e-4, fast_mode=True)
+    assert has_gradients(draw, leaves)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -583,9 +595,7 @@ GIVEN = [("scales", True), ("covars", False), ("matched", True), *((lens, False)
 
 @pytest.mark.parametrize(("given", "packed"), GIVEN)
 def test_gradients_equal_finite_differences(given, packed):
-    values, views = gaussians(8, degree=1) | {"backgrounds": torch.rand(2, 3, dtype=F64)}, two_views()
-    views |= {"width": 8, "height": 6}
-    views["Ks"] = views["Ks"] * torch.tensor([8 / SIZE[0], 6 / SIZE[1], 1], dtype=F64)[:, None]
+    values, views = gaussians(8, degree=1) | {"backgrounds": torch.rand(2, 3, dtype=F64)}, small_views(*EYES)
     fixed = {"packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased", "sh_degree": 1}
     if given == "matched":
         fixed |= {"rasterize_mode": "matched", "relative_rate": 0.5}
@@ -594,12 +604,7 @@ def test_gradients_equal_finite_differences(given, packed):
         values |= {"covars": covariances(values.pop("quats"), values.pop("scales"))}
         fixed |= {"quats": None, "scales": None}
     leaves = values | {"viewmats": views.pop("viewmats")}
-
-    def draw(*args: Tensor) -> tuple[Tensor, ...]:
-        return rasterization(**dict(zip(leaves, args, strict=True)), **views, **fixed)[:2]
-
-    inputs = [x.clone().requires_grad_() for x in leaves.values()]
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, rtol=1e-4, atol=1e-4, fast_mode=True)
+    assert has_gradients(lambda **given: rasterization(**given, **views, **fixed)[:2], leaves)
 
 
 @pytest.mark.parametrize("lens", [None, "fisheye"])
@@ -728,20 +733,13 @@ def test_gsplats_own_selective_adam_moves_visible_gaussians_alone():
     torch.testing.assert_close(param.detach(), expected)
 
 
-def test_opacities_may_be_a_column():
-    """As nerfstudio's parameters are."""
-    opacities, scales, counts = torch.rand(5), torch.rand(5, 3), torch.arange(5)
-    expected, widths = compute_relocation(opacities, scales, counts, torch.zeros(51, 51))
-    columns, same = compute_relocation(opacities[:, None], scales, counts, torch.zeros(51, 51))
-    assert columns.equal(expected[:, None])
-    assert same.equal(widths)
-
-
 @pytest.mark.parametrize("copies", [1, 2, 7, 51])
 def test_relocated_copies_look_like_one(copies):
     opacities, scales = torch.tensor([0.01, 0.5, 0.99, 1.0]), torch.rand(4, 3)
     counts = torch.tensor([copies, copies, copies, copies + 100 * (copies == 51)])
     new, wide = compute_relocation(opacities, scales, counts, torch.zeros(51, 51))
+    column, same = compute_relocation(opacities[:, None], scales, counts, torch.zeros(51, 51))  # as of nerfstudio
+    assert (column.equal(new[:, None]), same.equal(wide)) == (True, True)
     for old, o, factor in zip(opacities.tolist(), new.tolist(), (wide / scales).mean(dim=1).tolist(), strict=True):
         assert 1 - (1 - o) ** copies == pytest.approx(old, rel=1e-5)
         o = 1 - (1 - min(old, 1 - 2**-23)) ** (1 / copies)

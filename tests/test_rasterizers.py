@@ -7,20 +7,20 @@ the pixels where that can happen: all others must agree tightly, and those that 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import pytest
 import torch
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import EAGER
-from aaplug.core.splats import NEARER, Render, Splats2D
+from aaplug.core.splats import NEARER, Splats2D
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers import reference
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled, binning, forward, rasterizer
-from tests.conftest import ALL_RASTERIZERS, make_splats, memory_taken, needs_peak_memory, splats_of
+from tests.conftest import make_splats, memory_taken, needs_peak_memory, splats_of
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
@@ -29,11 +29,6 @@ TOLERANCE = 1e-5
 FLIPS = 1e-4  # share of pixels that may fall on the other side of a cut-off
 UNIT = (4.0, 0.0, 4.0)
 TILED, REFERENCE = Tiled(), Reference()
-
-
-@pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
-def rasterize(request: pytest.FixtureRequest) -> Callable[..., Render]:
-    return partial(request.param, pixel=POINT)
 
 
 def stack(*layers: tuple[float, tuple[float, float, float]]) -> Splats2D:

@@ -1,26 +1,18 @@
 """Laws of every rasterizer: those of the registry, plug-ins among them, and the compiled one."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels.point import POINT
-from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of
+from tests.conftest import make_splats, splats_of
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
 NAMES = ("means", "covs", "dets", "depths", "opacities", "sources", "rgb")
 SAME = 1e-6  # the order of a sum may change
-
-
-@pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
-def rasterize(request: pytest.FixtureRequest) -> Callable[..., Render]:
-    return partial(request.param, pixel=POINT)
 
 
 @pytest.fixture
