@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -48,8 +49,7 @@ from tests.conftest import SAMPLE
 from tests.test_documented import GAUSSIANS, few, write_cameras
 
 ROOT = Path(__file__).resolve().parents[1]
-PLUGIN = ROOT / "tests" / "plugin"
-GUIDE = ROOT / "examples" / "guides" / "contributing.md"
+GUIDE = (ROOT / "examples" / "guides" / "contributing.md").read_text()
 PROGRAM = """
 import json, sys
 from aaplug_cli.main import main
@@ -60,8 +60,9 @@ for words in json.loads(sys.argv[1]):
         if stop.code:
             raise
 """
-FILES = {path.name for path in (PLUGIN / "stranger").glob("[!_]*.py")}
-GROUPS = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]
+FILES = dict(re.findall(r"`stranger/(\w+\.py)`:\n\n```python\n(.*?)```$", GUIDE, re.M | re.S))
+(TOML,) = re.findall(r"`pyproject.toml`:\n\n```toml\n(.*?)```$", GUIDE, re.M | re.S)
+GROUPS = tomllib.loads(TOML)["project"]["entry-points"]
 CAMERAS = CameraSet((make_camera(size=(16, 12)),), (make_camera(size=(16, 12)),))
 LOOK = "{name} 40 30 50  {x} -4 1  0 0 0  {held_out}\n"  # see camera_format.py
 
@@ -70,7 +71,9 @@ LOOK = "{name} 40 30 50  {x} -4 1  0 0 0  {held_out}\n"  # see camera_format.py
 def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a process that has the plug-in installed, without pip: a .dist-info on the path is enough."""
     folder = tmp_path_factory.mktemp("site")
-    (folder / "stranger").symlink_to(PLUGIN / "stranger")
+    (folder / "stranger").mkdir()
+    for name, text in FILES.items():
+        (folder / "stranger" / name).write_text(text)
     record = folder / "stranger-1.0.dist-info"
     record.mkdir()
     (record / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
@@ -93,7 +96,7 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
     views = [("left", -1, 0), ("right", 1, 0), ("held", 0, 1)]
     lines = (LOOK.format(name=name, x=x, held_out=held) for name, x, held in views)
     (folder / "views.look").write_text("".join(lines))
-    commands = [line for line in GUIDE.read_text().splitlines() if line.startswith("aaplug ")]
+    commands = [line for line in GUIDE.splitlines() if line.startswith("aaplug ")]
     words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help", "aaplug recipes"]]
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(words)], cwd=folder, env=installed, capture_output=True, text=True
@@ -103,20 +106,19 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
     return folder
 
 
-def test_the_guide_shows_the_files_of_the_plug_in():
-    shown = dict(re.findall(r"`stranger/(\w+\.py)`:\n\n```python\n(.*?)```$", GUIDE.read_text(), re.M | re.S))
-    assert shown.keys() == FILES
-    for name, text in shown.items():
-        assert text == (PLUGIN / "stranger" / name).read_text(), name
-    (project,) = re.findall(r"`pyproject.toml`:\n\n```toml\n(.*?)```$", GUIDE.read_text(), re.M | re.S)
-    assert project == (PLUGIN / "pyproject.toml").read_text()
+@pytest.mark.skipif(shutil.which("ruff") is None, reason="ruff is not installed")
+@pytest.mark.parametrize("verb", ["check --ignore D1", "format --check"])
+@pytest.mark.parametrize("name", FILES)
+def test_the_files_of_the_plug_in_are_in_our_own_style(name, verb):
+    command = ["ruff", *verb.split(), "--no-cache", f"--stdin-filename=tests/{name}", "-"]
+    done = subprocess.run(command, cwd=ROOT, input=FILES[name], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
 
 
 def test_each_step_names_the_test_that_tries_it():
-    text = GUIDE.read_text()
-    rows = re.findall(r"^\| ([\d, ]+) \| (`test_.*) \|$", text, re.M)
+    rows = re.findall(r"^\| ([\d, ]+) \| (`test_.*) \|$", GUIDE, re.M)
     tried = {step for steps, _ in rows for step in steps.split(", ")}
-    assert tried == set(re.findall(r"^## (\d+)\. ", text, re.M))
+    assert tried == set(re.findall(r"^## (\d+)\. ", GUIDE, re.M))
     for _, names in rows:
         for name in re.findall(r"`(\w+)`", names):
             assert callable(globals().get(name)), name

@@ -1,1 +1,0 @@
-"""A plug-in of aaplug: one file for each kind of thing that can be added."""
