@@ -12,7 +12,7 @@ import pytest
 import aaplug
 from aaplug.evaluation.results import CEILING
 from aaplug.methods import RECIPES
-from tests.bench.claims import CLAIMS
+from tests.bench.claims import CLAIMS, FIGURES
 from tests.bench.claims import PAGE as PAGE_OF_CLAIMS
 from tests.bench.claims import page as claims_page
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
@@ -59,7 +59,9 @@ def test_tables_and_claims_are_made_from_the_result_files_to_the_digit():
     assert short_table() in METHODS
     assert shown_table() in (GUIDES / "viewers.md").read_text()
     assert PAGE_OF_CLAIMS.read_text() == claims_page()
-    assert len(CLAIMS) >= 20
+    numbers = [int(claim.number) for claim in CLAIMS]
+    assert numbers == [*range(1, len(numbers) + 1)]
+    assert len(FIGURES.keys() & {*numbers}) == len(FIGURES) > 20
 
 
 @pytest.mark.parametrize("scene", SCALES)
