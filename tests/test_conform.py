@@ -20,6 +20,7 @@ from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError, UsageError
 from tests.conftest import ALL_RASTERIZERS
+from tests.test_gsplat import composited
 
 CLASSIC = VIEWERS["classic"]
 BROKEN = [  # the ten things of the issue, and others that renderers were seen to do
@@ -124,7 +125,6 @@ def test_gsplats_torch_code_is_not_accused(viewer):
     rule = VIEWERS[viewer].convention
     matrix = torch.tensor([[[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1.0]]])
     pose = CAMERA.cam_from_world.float()[None]
-    y, x = torch.meshgrid(*(torch.arange(side) + 0.5 for side in CAMERA.hw), indexing="ij")
 
     def drawn(scene):
         sigma, _ = theirs._quat_scale_to_covar_preci(scene.unit_quats, scene.scales, compute_preci=False)
@@ -134,18 +134,9 @@ def test_gsplats_torch_code_is_not_accused(viewer):
         )
         sight = scene.means - CAMERA.centre.float()
         colours = (theirs._spherical_harmonics(3, sight, scene.sh) + 0.5).clamp(min=0)
-        image, left = torch.zeros(*CAMERA.hw, 3), torch.ones(CAMERA.hw)
-        for i in depths[0].argsort().tolist():
-            if not (radii[0, i] > 0).all():
-                continue
-            dx, dy = x - means[0, i, 0], y - means[0, i, 1]
-            a, b, c = conics[0, i]
-            opacity = scene.opacities[i] * (paid[0, i] if rule.compensated else 1.0)
-            alpha = (opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=0.999)
-            alpha = torch.where(alpha < 1 / 255, 0.0, alpha)
-            image += (left * alpha)[..., None] * colours[i]
-            left = left * (1 - alpha)
-        return quantised(image)
+        opacities = scene.opacities * paid if rule.compensated else scene.opacities[None]
+        meta = {"radii": radii, "means2d": means, "depths": depths, "conics": conics, "opacities": opacities}
+        return quantised(composited(meta, colours, 0, size=CAMERA.hw[::-1])[0].float())
 
     assert wrongs(judged({test.name: drawn(test.scene) for test in TESTS}, VIEWERS[viewer])) == set()
 

@@ -227,9 +227,11 @@ def test_arguments_have_gsplats_names_and_defaults(function):
 # ------------------------------------------------------------------------------------------------------------- images
 
 
-def composited(meta: dict[str, object], features: Tensor, camera: int, cap: float = 0.999) -> tuple[Tensor, Tensor]:
+def composited(
+    meta: dict[str, object], features: Tensor, camera: int, cap: float = 0.999, size: tuple[int, int] = SIZE
+) -> tuple[Tensor, Tensor]:
     """One image by the formula of alpha compositing from an unpacked `meta`: [h, w, d] and [h, w, 1]."""
-    width, height = SIZE
+    width, height = size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     order = meta["depths"][camera].argsort()
     order = order[(meta["radii"][camera, order] > 0).all(dim=1)]

@@ -26,6 +26,11 @@ def in_one_chunk(*counts: int) -> Pyramid:
     return Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
 
 
+def limited_to(levels: Pyramid, **choice: float) -> Renderer:
+    renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
+    return replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice(**choice, finer=1.0)))
+
+
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
     [
@@ -35,14 +40,9 @@ def in_one_chunk(*counts: int) -> Pyramid:
 )
 def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(budget, share, expected):
     """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 has 4 samples, at the rate of level 1."""
-    levels = in_one_chunk(200, 50, 45, 5)
-    renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
-    limited = replace(
-        renderer, recipe=replace(renderer.recipe, levels=LevelChoice(budget=budget, share=share, finer=1.0))
-    )
-    view = VIEWS[0].scaled(1 / 8)
+    limited, view = limited_to(in_one_chunk(200, 50, 45, 5), budget=budget, share=share), VIEWS[0].scaled(1 / 8)
     fine, samples = limited.sampled(view)
-    assert samples == renderer.samples(view) == 4
+    assert samples == limited.samples(view) == 4
     assert limited.coarsening(fine, samples) == expected
     assert limited.cutter is not None
     assert limited.cutter.count(fine, expected) == (50 if expected == 0 else 45)
@@ -60,9 +60,7 @@ def test_levels_of_several_samples_stay_as_fine_as_the_quality_asks(quality, exp
 @pytest.mark.parametrize("scale", [1 / 4.17, 1 / 5, 1 / 9, 1 / 10, 1 / 10.5])
 def test_where_no_level_is_light_enough_the_lightest_is_drawn_alone(scale):
     """And not two that fade."""
-    levels = in_one_chunk(200, 150, 120)
-    renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
-    limited = replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice(finer=1.0)))
+    limited = limited_to(in_one_chunk(200, 150, 120))
     fine, samples = limited.sampled(VIEWS[0].scaled(scale))
     assert limited.cutter is not None
     assert limited.cutter(fine, limited.coarsening(fine, samples)).shares is None

@@ -42,22 +42,21 @@ def _light(axes: Axes, ink: str) -> None:
     }
     for (name, share), colour in zip(shares.items(), COLOURS, strict=False):
         axes.plot(RATES, share, marker="o", ms=4, color=colour, label=name)
-    axes.set(xscale="log", yscale="log", xlabel="rate r", ylabel="light against training's", title="Statement 2")
-    axes.set_xticks(RATES, [scale_name(rate) for rate in RATES])
-    axes.minorticks_off()
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.grid(color=ink, alpha=0.12)
-    axes.legend()
+    axes.set(xlabel="rate r", ylabel="light against training's", title="Statement 2")
+    _labelled(axes, RATES, ink)
 
 
 def _merging(axes: Axes, ink: str) -> None:
     errors = [error(cell) for cell in CELLS]
     axes.plot(CELLS, errors, marker="o", ms=4, color=COLOURS[0], label="largest of 40 random cells")
     axes.plot(CELLS, LARGEST_THIRD * CELLS**3 / 6, color=ink, ls=(0, (4, 3)), lw=1, label="a₃ (h/s)³ / 6")
-    axes.set(
-        xscale="log", yscale="log", xlabel="cell h against filter s", ylabel="error of the light", title="Statement 6"
-    )
-    axes.set_xticks(CELLS, [scale_name(cell) for cell in CELLS])
+    axes.set(xlabel="cell h against filter s", ylabel="error of the light", title="Statement 6")
+    _labelled(axes, CELLS, ink)
+
+
+def _labelled(axes: Axes, places: np.ndarray, ink: str) -> None:
+    axes.set(xscale="log", yscale="log")
+    axes.set_xticks(places, [scale_name(place) for place in places])
     axes.minorticks_off()
     axes.yaxis.set_major_formatter("{x:g}")
     axes.grid(color=ink, alpha=0.12)

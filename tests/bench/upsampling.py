@@ -6,7 +6,6 @@ A network comes from the npm package @upscalerjs/esrgan-slim (MIT), which ships 
 
 import json
 import math
-import statistics
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,10 +16,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from aaplug.evaluation.upsamplers import find_upsampler
-from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.finetune import finetune
 from tests.bench import row
-from tests.bench.literature import Truths, photographs
+from tests.bench.literature import photographs, psnr
 from tests.bench.scenes import decibels, trained
 
 SCALE, VIEWS = 4, 5
@@ -43,7 +41,7 @@ def main(network: Path | None = None, steps: int = 200) -> None:
         if network is not None:
             upsamplers.append(str(exported(network, Path(folder) / "network.pt2")))
         for recipe in ("classic", "matched"):
-            row(f"`{recipe}`", *(f"{mean_psnr(opened.renderer(recipe), truths, scale):.2f}" for scale in (1.0, SCALE)))
+            row(f"`{recipe}`", *psnr(opened.renderer(recipe), truths))
         for name in upsamplers:
             larger = find_upsampler(name)
             with torch.no_grad():
@@ -54,14 +52,8 @@ def main(network: Path | None = None, steps: int = 200) -> None:
             options = {"method": "mipmap-gs", "scale": (float(SCALE),), "truth": "self", "views": truths[0][0].name}
             tuned = finetune(opened.scene, opened.cameras, None, steps=steps, upsampler=name, **options)
             adapted = replace(opened, scene=tuned.scene).renderer("classic")
-            figures = [f"{mean_psnr(adapted, truths, scale):.2f}" for scale in (1.0, SCALE)]
-            row(f"adapted to {Path(name).stem if name else 'our own guess'}, {steps} steps", *figures)
-
-
-@torch.no_grad()
-def mean_psnr(renderer: Renderer, truths: Truths, scale: float) -> float:
-    """PSNR at a scale, mean of the views."""
-    return statistics.mean(decibels(renderer(view.scaled(scale)).rgb, images[scale]) for view, images in truths)
+            guess = Path(name).stem if name else "our own guess"
+            row(f"adapted to {guess}, {steps} steps", *psnr(adapted, truths))
 
 
 class Layers(torch.nn.Module):
