@@ -176,15 +176,6 @@ def test_refusals_name_file_and_cause_and_write_nothing(cli, words):
     cli.refused(words, *REFUSED[words])
 
 
-def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
-    def interrupted(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("aaplug.verbs.convert.write_scene", interrupted)
-    assert cli(CONVERT)[0] == 130
-    assert not Path("new.ply").exists()
-
-
 def test_demo_does_the_whole_job(cli, monkeypatch):
     monkeypatch.setattr("aaplug.verbs.demo.SCALES", (0.25, 0.125))
     out, _ = cli.done("demo -o shown")

@@ -163,9 +163,12 @@ def test_gaussians_have_a_row_of_their_file_each(tmp_path):
     assert len(replace(read, **columns, origin=None)) == 2 * len(read)
 
 
-@pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "bluish", 3])
+NO_COLOURS = [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "bluish", 3, "rgb(0 51,300)", "rgb(0 51 300 / 50%)"]
+
+
+@pytest.mark.parametrize("background", NO_COLOURS)
 def test_a_background_is_a_colour(background):
-    with pytest.raises(UsageError, match=r"background: (expected|takes)"):
+    with pytest.raises(UsageError, match=r"^background: (expected|takes auto or an opaque colour)"):
         Renderer.of(make_scene(6), VIEWS, background=background)
 
 

@@ -108,6 +108,7 @@ REFUSED = {
     "evaluate s.ply -o out --show 5": "--show: selects views of the report; give --report, too",
     "compare a.ply b.ply --fail-under 30 --metric ssim": "--fail-under: is of PSNR, which --metric leaves out",
     "bench --gaussians 1e5": "takes N ..., each a whole number 1..100000000, got 1e5",
+    "view no.ply --no-browser --port 0": "no.ply: cannot be read: no such file",
     "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",
     "rendr s.ply": "there is no verb 'rendr'; did you mean render?",
     "gather out": "there is no verb 'gather'; it is gone, use evaluate with --scheduler; see `aaplug --help`",

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from aaplug.core.cameras import Camera
@@ -15,22 +14,12 @@ from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import CEILING, mean
 from aaplug.evaluation.truth import Truth
 from aaplug.methods import RECIPES
-from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rendering.renderer import Renderer, own_look
+from aaplug.rendering.renderer import own_look
 from tests.conftest import SAMPLE
 
 TOLERANCE = 1e-5  # of an image's range, away from cut-offs
 FLIPS = 1e-4  # share of pixels near a cut-off that may differ by more
-
-
-@pytest.mark.parametrize("rate", ["global", "interval"])
-def test_matched_draws_classic_pixels_on_the_sample(rate, sample_scene, sample_cameras, sample_training):
-    recipes = find_recipe("matched", rate_reference=rate), RECIPES["classic"]
-    renderers = [Renderer(sample_scene, sample_training, recipe, background=WHITE) for recipe in recipes]
-    view = window(sample_cameras.test[0], 300, 300, 200)
-    ours, theirs = (renderer(view).rgb for renderer in renderers)
-    assert (ours - theirs).abs().max() <= TOLERANCE
 
 
 def test_tiled_equals_the_reference_on_the_sample(sample_scene, sample_cameras, sample_training):

@@ -224,12 +224,6 @@ def test_a_host_that_cannot_be_listened_at_is_refused_by_name(seen, host):  # no
         pass
 
 
-def test_a_scene_that_fails_to_load_opens_no_page(cli):
-    code, _, err = cli("view missing.ply --no-browser --port 0")
-    assert (code, len(err.splitlines())) == (2, 1)
-    assert "missing.ply" in err
-
-
 def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
