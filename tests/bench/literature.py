@@ -1,8 +1,7 @@
 """The figures of examples/guides/methods.md on methods that papers name and aaplug has for comparison.
 
 Parts: the time of every recipe; `eaa` beside `analytic`; energy above the Nyquist rate; Group Training;
-learned filters; separable sinc and anisotropic filters; `obbl` on pixel-aligned Gaussians; then the benches
-`poses`, `discs`, `sequences` and `popping`.
+learned filters; separable sinc and anisotropic filters; `obbl` on pixel-aligned Gaussians.
 """
 
 import math
@@ -36,7 +35,7 @@ from aaplug.methods.pixel_kernels.raster_rows import OPACITY, forms_at
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.finetune import finetune
-from tests.bench import discs, popping, poses, row, sequences, timed
+from tests.bench import row, timed
 from tests.bench.scenes import Trained, decibels, trained
 
 SCALES = (1 / 2, 1 / 4, 1 / 8)
@@ -63,9 +62,6 @@ def main(parts: tuple[str, ...] = ()) -> None:
         if not parts or name in parts:
             print(f"\n{name}: {(part.__doc__ or '').splitlines()[0]}")
             part(chair)
-    for bench, options in BENCHES.items():
-        if not parts or bench.__name__.split(".")[-1] in parts:
-            bench.main(**options)
 
 
 def photographs(opened: Trained, scales: Sequence[float] = SCALES, views: Sequence[Camera] = ()) -> Truths:
@@ -300,4 +296,3 @@ def obbl(chair: Trained) -> None:
 
 
 PARTS = {part.__name__: part for part in (times, eaa, nyquist, groups, learned, sinc, obbl)}
-BENCHES: dict[Any, dict[str, Any]] = {poses: {}, discs: {}, sequences: {"frames": 4}, popping: {"size": 224}}
