@@ -253,13 +253,14 @@ def test_an_orbit_of_a_bare_file(cli):
         f"convert scene.ply -o new.ply {SMALL} --for classic --steps 0 --views orbit_0",
         f"evaluate scene.ply --recipe auto --truth self --scale 0.5 --views orbit_0,orbit_1 -o new {SMALL}",
         f"evaluate scene.ply scene.ply --recipe classic --scale 0.5 --metric psnr -o new {SMALL}",
+        f"compare scene.ply scene.ply -o new --scale 0.5 --metric psnr --views orbit_0,orbit_1 {SMALL}",
         f"finetune scene.ply -o new.ply --steps 1 --scale 0.5 --views orbit_0 {SMALL}",
         f"video scene.ply -o new.webm --seconds 0.05 --beside none {SMALL}",
         f"video scene.ply -o new.webm --seconds 0.05 --path orbit --resolution 40x40 {SMALL}",
         f"lod scene.ply -o new --levels 1 --steps 2 --views training_0_0,training_0_1 {SMALL}",
     ],
 )
-def test_every_verb_takes_a_bare_file(cli, words):
+def test_every_verb_takes_a_bare_file(cli, plots_drawn_once, words):
     _, err = cli.done(words)
     assert list(Path().glob("new*"))
     assert "training rate: assumed as of 48x36 px from the orbit" in err

@@ -149,15 +149,6 @@ def test_another_reference_and_levels_of_detail(cli):
     assert found["scenes"]["levels"]["bytes"] == sum(file.stat().st_size for file in Path("levels").iterdir())
 
 
-def test_bare_files_are_seen_from_an_orbit(cli):
-    for name in ("transforms_train.json", "transforms_test.json"):
-        Path(name).unlink()
-    words = "--rasterizer eager --orbit 2 --train-view 48x32 --scale 0.5 --metric psnr --json"
-    code, out, err = cli(f"compare scene.ply scene.ply {words}")
-    assert (code, json.loads(out)["protocol"]["views"]) == (0, 2)
-    assert "training rate: assumed" in err
-
-
 def test_differences_are_found_in_any_order(lopsided):
     moved = replace(lopsided, means=lopsided.means + torch.tensor([1e-4, 0.0, 0.0]), sh=lopsided.sh * 1.0)
     moved.sh[:, 1:4] += 0.01
