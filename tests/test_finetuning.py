@@ -147,6 +147,18 @@ def test_only_what_has_a_rate_moves():
         assert torch.equal(leaf, state.leaves[name]) == (name != "dc"), name
 
 
+def test_the_result_is_the_mean_of_the_last_steps():
+    job = make_job(settings=replace(SETTINGS, averaged=0.5))
+    alone, state = begin(job), begin(job)
+    steps = []
+    for _ in range(SETTINGS.steps):
+        advance(job, alone)
+        steps.append({name: leaf.detach().clone() for name, leaf in alone.leaves.items()})
+    run(job, state)
+    for name, leaf in state.leaves.items():
+        torch.testing.assert_close(leaf.detach(), sum(step[name] for step in steps[3:]) / 3, rtol=1e-6, atol=1e-6)
+
+
 def test_no_step_leaves_a_gaussian_thinner_than_its_bound():
     job = make_job(settings=replace(SETTINGS, rates={"log_scales": 0.5}, anchor=0.0))
     first, nyquist = job.start.scene.log_scales, 0.2**0.5 / job.start.training.bounds.highest_or_coarsest[:, None]
@@ -250,10 +262,12 @@ def test_groups_are_drawn_by_opacity():
 # runs
 
 
-@pytest.mark.parametrize(("method", "stopped_at"), [(CONSISTENCY, 2), (MIPMAP_GS, 3), (GROUP_TRAINING, 3)])
-def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stopped_at, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "stopped_at", "averaged"), [(CONSISTENCY, 2, 0.8), (MIPMAP_GS, 3, 0.0), (GROUP_TRAINING, 3, 0.0)]
+)
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stopped_at, averaged, tmp_path, monkeypatch):
     monkeypatch.setattr(mipmap_gs, "STEPS", 2)
-    job = replace(make_job(), method=method)
+    job = replace(make_job(settings=replace(SETTINGS, averaged=averaged)), method=method)
     whole = begin(job)
     assert run(job, whole, every=2)
     first, kept = begin(job), []
@@ -323,7 +337,7 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         with pytest.raises(FormatError, match="damaged"):
             load(tmp_path / "damaged.pt", job)
     torch.save(torch.load(path) | {"version": 1}, tmp_path / "old.pt")
-    said = "another version: expected aaplug finetune 7, got aaplug finetune 1; start again with `overwrite`"
+    said = "another version: expected aaplug finetune 8, got aaplug finetune 1; start again with `overwrite`"
     with pytest.raises(FormatError, match=said):
         load(tmp_path / "old.pt", job)
     with pytest.raises(UsageError, match="its steps was 6, now it is 13"):

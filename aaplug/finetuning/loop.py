@@ -50,6 +50,7 @@ def run(
     state.good = state.good or snapshot(state)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
+        _average(job.settings, state)
         if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
             step, rollbacks = state.step, state.rollbacks + 1
             if rollbacks > MAX_ROLLBACKS:
@@ -100,6 +101,20 @@ def advance(job: TuningJob, state: State) -> None:
         _clamp_parameters(state)
         if state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
             update_bounds(job, state)
+
+
+@torch.no_grad()
+def _average(settings: Settings, state: State) -> None:
+    """Take the parameters into their mean over the last steps, which they become at the end (Polyak and Juditsky 1992).
+
+    Each step leaves noise, as it sees one view; the mean has less.
+    """
+    count = state.step - round((1 - settings.averaged) * settings.steps)
+    for name in settings.rates if count > 0 else ():
+        leaf = state.leaves[name].data
+        mean = state.averages.setdefault(name, leaf.clone()).lerp_(leaf, 1 / count)
+        if state.step == settings.steps:
+            leaf.copy_(mean)
 
 
 def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[Float[Tensor, ""], Drawing]:

@@ -17,8 +17,7 @@ from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run
-from aaplug.finetuning.parameters import RATES
-from aaplug.finetuning.settings import Settings
+from aaplug.finetuning.settings import REFINING_AVERAGED, REFINING_DECAY, REFINING_RATES, Settings
 from aaplug.finetuning.state import TuningJob, begin
 from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
@@ -35,12 +34,9 @@ BYTES_PER_PIXEL = 6
 # The tuned views take these sizes in turn, as multiples of the training size.  A level is drawn alone at 1 to 3/2 times
 # its own rate and fades out below, so it learns these rates.  Its truth has the same sizes: whole boxes do not blur
 VIEW_SIZES = (1.0, 1.5, 1.0, 1.22, 1.5, 1.0, 1.22, 0.84)
-# The learning rates are these multiples of 3DGS's for an error of USUAL_ERROR.  They grow in proportion to the level's
-# error, because a step leaves noise in proportion to its length
-RATE_FACTORS = {"means": 1.0, "quats": 1.0, "log_scales": 3.0, "logit_opacities": 1.0, "dc": 2.0, "rest": 5.0}
-ALL_RATES_FACTOR = 0.3
-USUAL_ERROR = 0.02  # root mean square error, of colours in [0, 1]
-DECAY = 0.03  # of the learning rates, at the end
+# Root mean square error, of colours in [0, 1].  A level that is closer has lower learning rates in proportion, because
+# a step leaves noise in proportion to its length
+USUAL_ERROR = 0.02
 USUAL_STEPS_RATE = 1 / 4  # of the training rate: coarser levels take more steps, in inverse proportion
 MAX_STEPS_FACTOR = 8.0
 SMALLER_WEIGHT = 0.5  # of the loss at each of the smaller sizes, where errors are larger
@@ -86,10 +82,10 @@ def refine(
             tell(number, len(views))
             for scale in scales:
                 truth(view, scale)
-    factor = ALL_RATES_FACTOR * before**0.5 / USUAL_ERROR
-    rates = {name: factor * RATE_FACTORS[name] * (1 / rate if name == "means" else 1) * r for name, r in RATES.items()}
+    share = min(1.0, before**0.5 / USUAL_ERROR)
+    rates = {name: share * (1 / rate if name == "means" else 1) * r for name, r in REFINING_RATES.items()}
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
-    settings = Settings("levels", steps, weights, rates, decay=DECAY)
+    settings = Settings("levels", steps, weights, rates, decay=REFINING_DECAY, averaged=REFINING_AVERAGED)
     job = TuningJob(start, views, truth, settings, moving=len(level))
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:

@@ -24,6 +24,7 @@ class Settings:
     anchor: weight of the loss at the training size, which every step adds.
     rates: learning rate by parameter; a parameter without one stays fixed.
     decay: factor that the learning rates have reached at the end.
+    averaged: share of the steps, the last ones, whose mean is the result.
     loss: a name in `LOSSES`.
     """
 
@@ -33,15 +34,26 @@ class Settings:
     rates: Mapping[str, float]
     anchor: float = 0.0
     decay: float = 1.0
+    averaged: float = 0.0
     loss: str = "l2"
     seed: int = 0
 
 
 CONSISTENCY_SETTINGS = Settings("consistency", 1000, LOSS_WEIGHTS, RATES, anchor=ANCHOR_WEIGHT, decay=0.03)
-# 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
-GENTLE_RATES = {name: 0.3 * rate for name, rate in RATES.items()}
+# For scenes that are nearly right, as multiples of 3DGS's rates: means stay about where they are
+REFINING_FACTORS = {"means": 0.1, "quats": 1.0, "log_scales": 3.6, "logit_opacities": 3.0, "dc": 3.6, "rest": 1.5}
+REFINING_RATES = {name: factor * RATES[name] for name, factor in REFINING_FACTORS.items()}
+REFINING_DECAY, REFINING_AVERAGED = 0.3, 0.5
 # Conversion takes a few minutes by these; `balance` divides the weights by the scene's errors
-QUICK_SETTINGS = Settings("quick", 300, dict.fromkeys(LOSS_WEIGHTS, 1.0), GENTLE_RATES, anchor=4.0, decay=0.03)
+QUICK_SETTINGS = Settings(
+    "quick",
+    steps=300,
+    weights=dict.fromkeys(LOSS_WEIGHTS, 1.0),
+    rates=REFINING_RATES,
+    anchor=4.0,
+    decay=REFINING_DECAY,
+    averaged=REFINING_AVERAGED,
+)
 
 
 def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:

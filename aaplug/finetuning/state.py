@@ -32,7 +32,7 @@ from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
-FORMAT, VERSION = "aaplug finetune", 7  # of a checkpoint
+FORMAT, VERSION = "aaplug finetune", 8  # of a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +81,7 @@ class State:
     first_log_scales: of each Gaussian when the run or densification made it.
     bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
     gradients: sums over steps that densification needs, by name.
+    averages: means of the leaves over the last steps, by name.
     group: places of the Gaussians that train and are drawn; None for all.
     bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.
@@ -94,6 +95,7 @@ class State:
     first_log_scales: Float[Tensor, "n 3"]
     bounds: SamplingBounds
     gradients: dict[str, Tensor] = field(default_factory=dict)
+    averages: dict[str, Tensor] = field(default_factory=dict)
     group: Int[Tensor, " k"] | None = None
     bad_steps: int = 0
     rollbacks: int = 0
