@@ -316,12 +316,12 @@ def test_a_step_without_a_finite_gradient_changes_nothing(monkeypatch):
 
 
 def test_after_three_bad_steps_a_run_rolls_back_and_says_so(monkeypatch):
-    job, said = make_job(settings=replace(WITHOUT_SAME, steps=8)), []
+    job, said = make_job(settings=replace(WITHOUT_SAME, steps=8, averaged=0.7)), []
     spoil(monkeypatch, {3, 4, 5})
     state = begin(job)
     assert run(job, state, every=2, say=said.append)
     assert said == ["step 6: 3 steps without a finite gradient; back to step 2, at half the learning rates"]
-    assert (state.step, state.rollbacks) == (8, 1)
+    assert (state.step, state.rollbacks, state.averaged) == (8, 1, 2), "steps before the rollback are not in the mean"
     assert [entry["step"] for entry in state.curve] == [1, 2, 7, 8]
     spoil(monkeypatch, set(range(100)))
     monkeypatch.setattr(loop, "MAX_ROLLBACKS", 1)

@@ -109,10 +109,14 @@ def _average(settings: Settings, state: State) -> None:
 
     Each step leaves noise, as it sees one view; the mean has less.
     """
-    count = state.step - round((1 - settings.averaged) * settings.steps)
-    for name in settings.rates if count > 0 else ():
+    if state.step <= (1 - settings.averaged) * settings.steps:
+        return
+    state.averaged += 1
+    for name in settings.rates:
         leaf = state.leaves[name].data
-        mean = state.averages.setdefault(name, leaf.clone()).lerp_(leaf, 1 / count)
+        if state.averaged == 1:
+            state.averages[name] = leaf.clone()
+        mean = state.averages[name].lerp_(leaf, 1 / state.averaged)
         if state.step == settings.steps:
             leaf.copy_(mean)
 

@@ -81,7 +81,7 @@ class State:
     first_log_scales: of each Gaussian when the run or densification made it.
     bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
     gradients: sums over steps that densification needs, by name.
-    averages: means of the leaves over the last steps, by name.
+    averages: means of the leaves over the last steps, by name.  averaged: number of these steps.
     group: places of the Gaussians that train and are drawn; None for all.
     bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.
@@ -96,6 +96,7 @@ class State:
     bounds: SamplingBounds
     gradients: dict[str, Tensor] = field(default_factory=dict)
     averages: dict[str, Tensor] = field(default_factory=dict)
+    averaged: int = 0
     group: Int[Tensor, " k"] | None = None
     bad_steps: int = 0
     rollbacks: int = 0
