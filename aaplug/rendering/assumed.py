@@ -55,10 +55,8 @@ def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> Came
     scene = scene_of(scene)
     sample = scene.sample(PROBE_ROWS)
     frame = frame_around(scene, orbit, sample)
-    path, up = (
-        scene.source,
-        f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})",
-    )
+    path = scene.source
+    up = f"up: {' '.join(f'{x:.4g}' for x in frame.up.tolist())} ({up_evidence(scene, orbit, frame)})"
     if orbit.train_view is orbit.train_rate is None and (own := scene.cameras) is not None:
         free = replace(own.train[0], trained_focal=None)
         return replace(own, test=_orbit_views(orbit, frame, free), notes=(*own.notes, up))

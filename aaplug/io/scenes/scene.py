@@ -170,7 +170,8 @@ class Scene:
     @property
     def cameras(self) -> CameraSet | None:
         """The cameras of `camera_path`; None if there are none.  Raises as `read_cameras`."""
-        return None if self.camera_path is None else read_cameras(self.camera_path)
+        path = self.camera_path
+        return None if path is None else read_cameras(path)
 
     @property
     def levels(self) -> Pyramid | None:
