@@ -17,7 +17,7 @@ from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run
-from aaplug.finetuning.settings import REFINING_AVERAGED, REFINING_DECAY, REFINING_RATES, Settings
+from aaplug.finetuning.settings import CONSISTENCY_SETTINGS, TUNING_RATES
 from aaplug.finetuning.state import TuningJob, begin
 from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
@@ -83,9 +83,9 @@ def refine(
             for scale in scales:
                 truth(view, scale)
     share = min(1.0, before**0.5 / USUAL_ERROR)
-    rates = {name: share * (1 / rate if name == "means" else 1) * r for name, r in REFINING_RATES.items()}
+    rates = {name: share * (1 / rate if name == "means" else 1) * r for name, r in TUNING_RATES.items()}
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
-    settings = Settings("levels", steps, weights, rates, decay=REFINING_DECAY, averaged=REFINING_AVERAGED)
+    settings = replace(CONSISTENCY_SETTINGS, name="levels", steps=steps, weights=weights, rates=rates, anchor=0.0)
     job = TuningJob(start, views, truth, settings, moving=len(level))
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:

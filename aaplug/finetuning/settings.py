@@ -39,20 +39,15 @@ class Settings:
     seed: int = 0
 
 
-CONSISTENCY_SETTINGS = Settings("consistency", 1000, LOSS_WEIGHTS, RATES, anchor=ANCHOR_WEIGHT, decay=0.03)
 # For scenes that are nearly right, as multiples of 3DGS's rates: means stay about where they are
-REFINING_FACTORS = {"means": 0.1, "quats": 1.0, "log_scales": 3.6, "logit_opacities": 3.0, "dc": 3.6, "rest": 1.5}
-REFINING_RATES = {name: factor * RATES[name] for name, factor in REFINING_FACTORS.items()}
-REFINING_DECAY, REFINING_AVERAGED = 0.3, 0.5
+TUNING_FACTORS = {"means": 0.1, "quats": 1.0, "log_scales": 3.6, "logit_opacities": 3.0, "dc": 3.6, "rest": 1.5}
+TUNING_RATES = {name: factor * RATES[name] for name, factor in TUNING_FACTORS.items()}
+CONSISTENCY_SETTINGS = Settings(
+    "consistency", 1000, LOSS_WEIGHTS, TUNING_RATES, anchor=ANCHOR_WEIGHT, decay=0.3, averaged=0.5
+)
 # Conversion takes a few minutes by these; `balance` divides the weights by the scene's errors
-QUICK_SETTINGS = Settings(
-    "quick",
-    steps=300,
-    weights=dict.fromkeys(LOSS_WEIGHTS, 1.0),
-    rates=REFINING_RATES,
-    anchor=4.0,
-    decay=REFINING_DECAY,
-    averaged=REFINING_AVERAGED,
+QUICK_SETTINGS = replace(
+    CONSISTENCY_SETTINGS, name="quick", steps=300, weights=dict.fromkeys(LOSS_WEIGHTS, 1.0), anchor=4.0
 )
 
 
@@ -69,7 +64,8 @@ def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
 def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:
     """One model for all scales and the training size."""
     weights = {scale: LOSS_WEIGHTS.get(scale, 1.0) for scale in scales}
-    return replace(CONSISTENCY_SETTINGS, weights=weights, rates={name: RATES[name] for name in move}, anchor=anchor)
+    rates = {name: CONSISTENCY_SETTINGS.rates[name] for name in move}
+    return replace(CONSISTENCY_SETTINGS, weights=weights, rates=rates, anchor=anchor)
 
 
 @dataclass(frozen=True)
