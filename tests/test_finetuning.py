@@ -68,14 +68,6 @@ def test_the_number_of_threads_plays_no_part(monkeypatch):
     assert all(torch.equal(leaf, two.leaves[name]) for name, leaf in one.leaves.items())
 
 
-def test_only_the_first_gaussians_move():
-    job = replace(make_job(settings=replace(SETTINGS, anchor=0.0)), moving=20)
-    scene = after(job).scene(job)
-    for name, column in scene.columns.items():
-        assert torch.equal(column[20:], job.start.scene.columns[name][20:]), name
-        assert not torch.equal(column[:20], job.start.scene.columns[name][:20]), name
-
-
 # losses
 
 

@@ -22,10 +22,14 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Cutter, Pyramid, faded
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
+from aaplug.evaluation.truth import Truth
 from aaplug.finetuning import refining
+from aaplug.io.rad import node_sizes, shown_of
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.pyramid_folder import MANIFEST, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merge_in_chunks
+from aaplug.methods.presets import recipe_of
+from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import FormatError
@@ -385,6 +389,27 @@ def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
         shown = (Renderer.of(s.scene, few, recipe)(view).rgb for s in (merged, tuned))
         before, after = ((image - truth).square().mean() for image in shown)
         assert after < 0.9 * before
+
+
+def test_tuning_a_tree_brings_what_spark_draws_of_it_closer(tmp_path, monkeypatch, sample_scene, sample_cameras):
+    def spy(tree, parents, rates, look, *how):
+        tuned = refining.refine_tree(tree, parents, rates, look, *how)
+        for rate in rates:
+            errors = []
+            for scene in (tree, tuned):
+                distances = (scene.means - view.centre).norm(dim=1)
+                shown = shown_of(node_sizes(scene) * rate * view.focal / distances, parents)
+                image = replace(look, recipe=recipe_of(VIEWERS["spark"])).showing(scene[shown])(view.scaled(rate)).rgb
+                errors.append((image - Truth(look)(view, rate)).square().mean().item())
+            shares[rate] = errors[1] / errors[0]
+        return tuned
+
+    few = CameraSet(tuple(view.scaled(0.25).as_trained() for view in sample_cameras.train[:5]), ())
+    few, view, shares = CameraSet(few.train[:4], ()), few.train[4], {}
+    monkeypatch.setattr("aaplug.verbs.lod.refine_tree", spy)
+    aaplug.lod(sample_scene[::12], few, tmp_path, levels=2, to="rad", steps=60)
+    assert [*shares] == [1.0, 0.5, 0.25]
+    assert max(shares.values()) < 0.9
 
 
 def test_a_level_is_tuned_over_the_rates_that_draw_it_and_on_free_poses_too(sample_cameras):

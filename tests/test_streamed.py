@@ -6,6 +6,7 @@ import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -206,8 +207,8 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
 def test_nothing_is_left_of_a_longer_run_that_was_cut_short_and_parts_are_for_their_viewer(tmp_path, monkeypatch, to):
     """Also without tuning."""
     out, stream, written = tmp_path / "out", streamed.STREAMS[to], streamed.write_index
-    monkeypatch.setattr("aaplug.io.streamed.write_index", lambda folder, *rest: written(tmp_path / "elsewhere", *rest))
-    with pytest.raises(FormatError, match="no such file"):
+    monkeypatch.setattr("aaplug.io.streamed.write_index", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
         made(out, to)
     assert (out / "lod.json").exists()
     monkeypatch.setattr("aaplug.io.streamed.write_index", written)
@@ -248,6 +249,22 @@ def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypat
         assert place == (written[tuple(SCENE.means[parent].tolist())] if parent >= 0 else 0)
 
 
+def test_spark_draws_a_small_gaussian_below_large_ones():
+    def descend(place: int) -> set[int]:
+        children = [child for child, parent in enumerate(parents) if parent == place]
+        if sizes[place] <= rad.MAX_NODE_SIZE or not children:
+            return {place}
+        return set().union(*map(descend, children))
+
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        parents = [int(torch.randint(i + 1, 60, (), generator=generator)) for i in range(59)] + [-1]
+        sizes = (2 * torch.rand(60, generator=generator) + torch.arange(60) / 60).tolist()
+        found = rad.shown_of(torch.tensor(sizes), torch.tensor(parents))
+        assert set(found.tolist()) == descend(59)
+    assert rad.shown_of(torch.tensor([9.0, 1.0]), torch.tensor([-1, -1])).tolist() == [0, 1]
+
+
 @pytest.mark.parametrize("scene", ["faint", "large, of degree 4", "in float64", "large, alone"])
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
     given = {
@@ -282,7 +299,7 @@ def test_a_damaged_tree_is_refused(tmp_path):
         streamed.read_front(tmp_path, 0)
     (tmp_path / "0_0" / streamed.TREE).write_bytes(b"PK")
     with pytest.raises(FormatError, match=r"tree\.npz.*is damaged"):
-        streamed.write_index(tmp_path, "rad", 1, 1.0, frame_of(SCENE))
+        streamed.read_front(tmp_path, 0)
 
 
 def test_fronts_are_removed_and_nothing_else(tmp_path):

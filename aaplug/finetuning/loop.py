@@ -72,7 +72,7 @@ def advance(job: TuningJob, state: State) -> None:
     """Take one step, as the method has it; if a loss or gradient is not finite, the step is only counted."""
     settings = job.settings
     with job.method.around(job, state) as drawings:
-        view, weights = _view_and_weights(settings, job.views, state.step)
+        view, weights = view_and_weights(settings, job.views, state.step)
         state.adam.zero_grad(set_to_none=True)
         losses = {}
         for scale, weight in weights.items():
@@ -87,9 +87,6 @@ def advance(job: TuningJob, state: State) -> None:
         if not all(map(math.isfinite, losses.values())) or not all(bool(g.sum().isfinite()) for g in gradients):
             state.bad_steps += 1
             return
-        if job.moving is not None:
-            for gradient in gradients:
-                gradient[job.moving :] = 0
         state.bad_steps = 0
         state.curve.append({"step": state.step, "view": view.name, "loss": losses})
         decay = settings.decay ** (state.step / settings.steps) * BACK_OFF**state.rollbacks
@@ -145,7 +142,7 @@ def update_bounds(job: TuningJob, state: State) -> None:
     _clamp_parameters(state)
 
 
-def _view_and_weights(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:
+def view_and_weights(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:
     """View of a step, and weight by scale; a random permutation per epoch uses every view once before any repeats."""
     count = len(views)
     of_epoch = torch.Generator().manual_seed(settings.seed * SEED_STRIDE + step // count)

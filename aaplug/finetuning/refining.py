@@ -6,19 +6,23 @@ lengths, and the rest as free ones: the two rules draw a Gaussian somewhat diffe
 """
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import cycle
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from aaplug.core.camera_paths import free_views
 from aaplug.core.cameras import Camera, spread
-from aaplug.core.gaussians import Fusion, Gaussians, joined
+from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.truth import MEMORY, Truth
-from aaplug.finetuning.loop import run
-from aaplug.finetuning.settings import CONSISTENCY_SETTINGS, TUNING_RATES
-from aaplug.finetuning.state import TuningJob, begin
+from aaplug.finetuning.loop import run, view_and_weights
+from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, TUNING_RATES, balance
+from aaplug.finetuning.state import State, TuningJob, begin
+from aaplug.io.rad import node_sizes, shown_of
 from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import Viewer
@@ -42,6 +46,8 @@ MAX_STEPS_FACTOR = 8.0
 SMALLER_WEIGHT = 0.5  # of the loss at each of the smaller sizes, where errors are larger
 CLOSE_ENOUGH = 3.5e-5  # mean square error, 44.5 dB: a level that is closer is not tuned
 
+Shown = Callable[[Gaussians, Camera], Int[Tensor, " k"]]  # places of the Gaussians of a scene that a view shows
+
 
 def refine(
     level: Gaussians,
@@ -52,7 +58,6 @@ def refine(
     viewer: Viewer | None = None,
     monitor: Monitor = SILENT,
     smaller: Sequence[float] = (),
-    beside: Gaussians | None = None,
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
@@ -62,7 +67,6 @@ def refine(
     poses: views to tune on, at the training size.
     viewer: what will draw the result; None for aaplug.
     smaller: sizes of images, against those at `rate`, that should be right too; steps take all sizes equally often.
-    beside: Gaussians that are drawn with the level and stay as they are.
 
     Raises UsageError if no step has a finite gradient.
     """
@@ -73,21 +77,73 @@ def refine(
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
         look = replace(look, recipe=recipe_of(viewer))
-    start = look.showing(level if beside is None else joined([level, beside]))
+    start = look.showing(level)
     before = _error(start, truth, probes, rate)
     if before < CLOSE_ENOUGH:
         return level
-    with torch.no_grad(), monitor.progress("rendering", "views") as tell:
-        for number, view in enumerate(views):
-            tell(number, len(views))
-            for scale in scales:
-                truth(view, scale)
     share = min(1.0, before**0.5 / USUAL_ERROR)
     rates = {name: share * (1 / rate if name == "means" else 1) * r for name, r in TUNING_RATES.items()}
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
     settings = replace(CONSISTENCY_SETTINGS, name="levels", steps=steps, weights=weights, rates=rates, anchor=0.0)
-    job = TuningJob(start, views, truth, settings, moving=len(level))
-    state = begin(job)
+    scene = _tuned(TuningJob(start, views, truth, settings), monitor)
+    if _error(look.showing(scene), truth, probes, rate) >= before:
+        return level
+    record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name if viewer else "levels"})
+    return replace(scene, fused=(*level.fused, record))
+
+
+def refine_tree(
+    tree: Gaussians,
+    parents: Int[Tensor, " n"],
+    rates: Sequence[float],
+    look: Renderer,
+    poses: Sequence[Camera],
+    steps: int,
+    viewer: Viewer,
+    monitor: Monitor = SILENT,
+) -> Gaussians:
+    """A tree after tuning: each step draws what Spark draws of it at one of the rates; as it is where that is no help.
+
+    A Gaussian is drawn at several rates, beside finer and coarser ones, so all are tuned together.
+
+    parents: place of each one's parent; -1 for none.
+    rates: see `refine`; one is 1.  The others: as there.
+    """
+    views, probes = _views(poses, rates, steps)
+    truth, start = Truth(look, memory=MEMORY), replace(look, recipe=recipe_of(viewer)).showing(tree)
+
+    def shown(scene: Gaussians, view: Camera) -> Int[Tensor, " k"]:
+        distances = (scene.means - view.centre.to(scene.means)).norm(dim=1)
+        return shown_of(node_sizes(scene) * view.focal / distances, parents)
+
+    def errors(renderer: Renderer) -> dict[float, float]:
+        return {r: _error(renderer, truth, probes, r, shown) for r in rates}
+
+    @contextmanager
+    def around(job: TuningJob, state: State) -> Iterator[None]:
+        view, (rate,) = view_and_weights(job.settings, job.views, state.step)
+        state.group = shown(state.scene(job), view.scaled(rate))
+        yield
+
+    before = errors(start)
+    settings = replace(CONSISTENCY_SETTINGS, name="tree", steps=steps, weights=dict.fromkeys(rates, 1.0), anchor=0.0)
+    settings = balance(settings, before)
+    scene = _tuned(TuningJob(start, views, truth, settings, method=replace(CONSISTENCY, around=around)), monitor)
+    after = errors(start.showing(scene))
+    if sum(weight * (after[rate] - before[rate]) for rate, weight in settings.weights.items()) >= 0:
+        return tree
+    record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name})
+    return replace(scene, fused=(*tree.fused, record))
+
+
+def _tuned(job: TuningJob, monitor: Monitor) -> Gaussians:
+    """The scene of a job after all of its steps."""
+    with torch.no_grad(), monitor.progress("rendering", "views") as tell:
+        for number, view in enumerate(job.views):
+            tell(number, len(job.views))
+            for scale in job.settings.weights:
+                job.truth(view, scale)
+    state, steps = begin(job), job.settings.steps
     with monitor.progress("refining", "steps") as tell:
 
         def stop() -> bool:
@@ -95,11 +151,7 @@ def refine(
             return False
 
         run(job, state, every=steps, stop=stop, say=monitor.say)
-    scene = state.scene(job)
-    if _error(replace(state.renderer(job), scene=scene), truth, probes, rate) >= before:
-        return level
-    record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name if viewer else "levels"})
-    return replace(scene[: len(level)], fused=(*level.fused, record))
+    return state.scene(job)
 
 
 def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tuple[list[Camera], list[Camera]]:
@@ -118,7 +170,11 @@ def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tupl
 
 
 @torch.no_grad()
-def _error(renderer: Renderer, truth: Truth, views: Sequence[Camera], rate: float) -> float:
-    """Mean square error at the level's own rate."""
-    errors = [renderer(view.scaled(rate)).rgb.clamp(0, 1) - truth(view, rate) for view in views]
-    return sum(float(error.square().mean()) for error in errors) / len(errors)
+def _error(renderer: Renderer, truth: Truth, views: Sequence[Camera], rate: float, shown: Shown | None = None) -> float:
+    """Mean square error at a rate.  shown: the Gaussians that a view shows; None for all."""
+    errors = []
+    for view in views:
+        small, scene = view.scaled(rate), renderer.scene
+        drawing = renderer if shown is None else renderer.showing(scene[shown(scene, small)])
+        errors.append(float((drawing(small).rgb.clamp(0, 1) - truth(view, rate)).square().mean()))
+    return statistics.mean(errors)

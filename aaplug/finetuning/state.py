@@ -44,7 +44,6 @@ class TuningJob:
     truth: the images that renders are compared with.
     upsampler: what makes its larger images, as text that changes if it does.
     method: the way to fine-tune.
-    moving: how many Gaussians move, the first ones; None for all.
     """
 
     start: Renderer
@@ -53,7 +52,6 @@ class TuningJob:
     settings: Settings
     upsampler: str = ""
     method: Method = CONSISTENCY
-    moving: int | None = None
 
     @cached_property
     def facts(self) -> dict[str, str]:

@@ -59,6 +59,20 @@ def node_sizes(scene: Gaussians) -> Float[Tensor, " n"]:
     return MEAN_SIGMAS * scene.scales.mean(dim=1)
 
 
+def shown_of(sizes: Float[Tensor, " n"], parents: Int[Tensor, " n"]) -> Int[Tensor, " k"]:
+    """Places of the Gaussians of a tree that Spark draws: small enough themselves, and their parents are not.
+
+    sizes: see `node_sizes`, in px.  parents: place of each one's parent; -1 for none.
+    """
+    replaced = sizes > MAX_NODE_SIZE
+    replaced[torch.ones_like(parents, dtype=torch.bool).index_fill_(0, parents[parents >= 0], False)] = False  # leaves
+    shown, above = ~replaced, parents
+    while bool((inner := above >= 0).any()):
+        shown &= ~inner | replaced[above]
+        above = torch.where(inner, parents[above], above)
+    return shown.nonzero()[:, 0]
+
+
 def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
     """The tree of Gaussians; where there are too many siblings, or several without a parent, others come above them.
 

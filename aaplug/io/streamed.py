@@ -193,17 +193,23 @@ def front_folders(folder: Path) -> Iterator[Path]:
 
 
 def write_index(
-    folder: Path, name: StreamName, levels: int, rate: float, frame: Frame, compensated: bool = True
+    folder: Path,
+    name: StreamName,
+    levels: int,
+    rate: float,
+    frame: Frame,
+    compensated: bool = True,
+    tree: Front | None = None,
 ) -> Mapping[str, Any]:
     """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
     rate: of training, in px per world unit.  frame: what a page shows first.
     compensated: levels are for a rule with compensation.
+    tree: of a .rad.
     """
     stream = STREAMS[name]
-    if name == "rad":
-        front = read_front(folder, levels - 1)
-        content, settings = rad_of(tree_of(front.scene, front.parents)), _spark_settings(front)
+    if tree is not None:
+        content, settings = rad_of(tree_of(tree.scene, tree.parents)), _spark_settings(tree)
     else:
         parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)

@@ -38,7 +38,7 @@ COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
 METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=None)
 USUAL_METHOD = "consistency"  # of fine-tuning
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
-SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
+SINGLE_FILE_FACTOR = 2  # times as many steps for one scene, whose count is met, and for a tree, which is for all sizes
 LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
 ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the scales
 TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
@@ -237,7 +237,7 @@ class LodOptions(WritingOptions, ViewOptions):
     refine: bool = True
     """Merge alone, without the tuning, which takes minutes."""
     steps: Annotated[int | None, STEPS] = None
-    """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
+    """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene or a .rad)."""
     resume: bool = False
     """Keep the levels that are there, if they were made of the same scene, cameras and options."""
 
@@ -270,8 +270,8 @@ class LodOptions(WritingOptions, ViewOptions):
 
     @property
     def tuning(self) -> int:
-        """Steps of tuning for a rate of 1/4 and above; 0 for none."""
-        usual = SINGLE_SCENE_FACTOR * LEVEL_STEPS if self.single else LEVEL_STEPS
+        """Steps of tuning for one file, or for a rate of 1/4 and above; 0 for none."""
+        usual = SINGLE_FILE_FACTOR * LEVEL_STEPS if self.single or self.to == "rad" else LEVEL_STEPS
         return (usual if self.steps is None else self.steps) if self.refine else 0
 
 

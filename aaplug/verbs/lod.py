@@ -19,7 +19,7 @@ from aaplug.core.pyramids import Level
 from aaplug.core.sampling import check_frame, median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.finetuning.refining import refine
+from aaplug.finetuning.refining import refine, refine_tree
 from aaplug.io import StreamName, streamed
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
@@ -154,15 +154,15 @@ class _Maker:
         monitor.say(f"{counted(len(level.scene), 'Gaussian')} for {goal.rate:.3g} × the training rate")
         return self._tuned(level) if self.viewer is None else level
 
-    def finished(self, level: Level, beside: Gaussians | None = None) -> Level:
+    def finished(self, level: Level) -> Level:
         """The level as its file holds it: tuned or, without tuning, converted for the viewer, if there is one.
 
-        beside: Gaussians that are drawn with the level, as they are.
+        Levels of a tree are tuned later, all together.
         """
         if self.viewer is None or not len(level.scene):
             return level
-        if self.job.options.tuning:
-            return self._tuned(level, beside)
+        if self.job.options.tuning and self.job.options.to != "rad":
+            return self._tuned(level)
         training = TrainingViews.of(level.scene, self.job.cameras, min_seen=0.0)
         return level._replace(scene=fuse_for(level.scene, training, self.viewer))
 
@@ -184,7 +184,7 @@ class _Maker:
         taken, goes = small.nonzero()[:, 0], small[owners]
         if not len(taken):
             return front._replace(owners=owners)
-        new = self.finished(level._replace(scene=level.scene[taken]), front.scene[places[~goes]]).scene
+        new = self.finished(level._replace(scene=level.scene[taken])).scene
         parents = len(front.scene) + (small.cumsum(0) - 1)[owners[goes]]
         return Front(
             joined([front.scene, new]),
@@ -192,7 +192,15 @@ class _Maker:
             torch.cat([owners[~goes], taken]),
         )
 
-    def _tuned(self, level: Level, beside: Gaussians | None = None) -> Level:
+    def tuned_tree(self, front: Front, rates: Sequence[float]) -> Front:
+        """The tree after tuning for the rates of its levels."""
+        options, look, viewer = self.job.options, self.look, self.viewer
+        if not options.tuning or look is None or viewer is None:
+            return front
+        how = (rates, look, self.views, options.tuning, viewer, self.job.monitor)
+        return front._replace(scene=refine_tree(front.scene, front.parents, *how))
+
+    def _tuned(self, level: Level) -> Level:
         options, look = self.job.options, self.look
         if not options.tuning or look is None or self.scene.flat:
             return level
@@ -201,7 +209,7 @@ class _Maker:
             steps = options.steps if usual and options.steps is not None else usual
             return level._replace(scene=fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)[0])
         smaller = SMALLER_IMAGES if options.single and self.viewer is None else ()
-        how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller, beside)
+        how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller)
         scene = refine(level.scene, level.rate, look, *how)
         return level._replace(scene=scene)
 
@@ -290,7 +298,10 @@ def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]
     up = up_of(cameras).tolist()
     frame = frame_of(maker.job.scene.sample(PROBE_ROWS), up if any(up) else None)
     rate = float(rates[rates > 0].median())
-    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated)
+    tree = None
+    if to == "rad":
+        tree = maker.tuned_tree(streamed.read_front(folder, len(levels) - 1), [level.rate for level in levels])
+    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree)
     if options.page is not None:
         streamed.write_page(folder, to, Path(options.page))
     maker.job.monitor.say(f"set the viewer by {folder / streamed.SETTINGS}: {json.dumps(settings)}")
