@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import LOSSES, loop
+from aaplug.finetuning.fitting import fit
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, l2
@@ -25,6 +27,8 @@ from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
 from aaplug.lab.losses import l1_dssim, structural_similarity
 from aaplug.lab.mipmap_gs import MIN_GRADIENT, MIN_OPACITY, MIPMAP_GS, SPLIT_SHRINKAGE, densify, moments_after
 from aaplug.methods import RECIPES
+from aaplug.methods.presets import recipe_of
+from aaplug.methods.viewers import VIEWERS
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
 from aaplug.system.cores import FREE_CORES
@@ -66,6 +70,22 @@ def test_the_number_of_threads_plays_no_part(monkeypatch):
     one, two = states
     assert one.curve == two.curve
     assert all(torch.equal(leaf, two.leaves[name]) for name, leaf in one.leaves.items())
+
+
+def test_steps_draw_by_several_rules_in_turn(monkeypatch):
+    """As for khr, whose files programs show by rules of their own."""
+    tuning = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("aaplug.finetuning.fitting.tune", tuning)
+    scene, look = make_scene(60), make_job().truth.renderer
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, VIEWERS["khr"], look, VIEWS, 1)
+    recipes = tuning.call_args.args[0].recipes
+    assert recipes == [recipe_of(VIEWERS[name]) for name in ("khr", "cesium", "babylon-classic")]
+    state = begin(job := replace(make_job(), recipes=recipes))
+    for state.step in range(4):
+        one = replace(make_job(), recipes=[recipes[state.step % 3]])
+        assert loss_at(job, state, VIEWS[0], 0.5)[0] == loss_at(one, state, VIEWS[0], 0.5)[0]
+    assert len({replace(job, recipes=turns).facts["recipe"] for turns in (recipes, recipes[::-1], ())}) == 3
 
 
 # losses

@@ -14,11 +14,11 @@ from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import QUICK_SETTINGS, balance
+from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance
 from aaplug.finetuning.state import TuningJob
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
-from aaplug.methods.viewers import Viewer
+from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.monitor import SILENT, Monitor
 
@@ -61,7 +61,9 @@ def fit(
         start = original
     psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
     errors = {s: max(ROUNDING_ERROR, 0.0 if dB is None else 10 ** (-dB / 10)) for s, dB in psnr.items()}
-    job = TuningJob(start, original.training.cameras, truth, balance(replace(QUICK_SETTINGS, steps=steps), errors))
+    settings = balance(replace(SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS, steps=steps), errors)
+    recipes = [recipe_of(v) for v in (viewer, *(VIEWERS[name] for name in viewer.shown_by))]
+    job = TuningJob(start, original.training.cameras, truth, settings, recipes=recipes)
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
     closed_form = before.once_more(CLOSED_FORM, CONVERTED)

@@ -77,7 +77,7 @@ def advance(job: TuningJob, state: State) -> None:
         losses = {}
         for scale, weight in weights.items():
             loss, drawing = loss_at(job, state, view, scale)
-            with on_free_cores(), blaming(*state.renderer(job).recipe.parts, ("loss", LOSSES[settings.loss])):
+            with on_free_cores(), blaming(*state.renderer_of_step(job).recipe.parts, ("loss", LOSSES[settings.loss])):
                 (weight * loss).backward()
             losses[scale] = loss.item()
             if drawings is not None:
@@ -121,7 +121,7 @@ def _average(settings: Settings, state: State) -> None:
 def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[Float[Tensor, ""], Drawing]:
     """Loss of one view at one scale, and its drawing, whose screen-space means retain their gradients."""
     truth = job.truth(view, scale)
-    drawing = state.renderer(job).draw(view.scaled(scale))
+    drawing = state.renderer_of_step(job).draw(view.scaled(scale))
     if drawing.splats.means.requires_grad:
         drawing.splats.means.retain_grad()
     image = drawing.render.rgb

@@ -25,6 +25,7 @@ from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import CONSISTENCY, Method, Settings
 from aaplug.io.atomic import replacing
+from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import AaplugError, FormatError, UsageError, printable
@@ -44,6 +45,7 @@ class TuningJob:
     truth: the images that renders are compared with.
     upsampler: what makes its larger images, as text that changes if it does.
     method: the way to fine-tune.
+    recipes: by which steps draw in turn; none for the start's.
     """
 
     start: Renderer
@@ -52,6 +54,7 @@ class TuningJob:
     settings: Settings
     upsampler: str = ""
     method: Method = CONSISTENCY
+    recipes: Sequence[Recipe] = ()
 
     @cached_property
     def facts(self) -> dict[str, str]:
@@ -62,7 +65,7 @@ class TuningJob:
         return settings | {
             "scene": digest_of_scene(start.scene),
             "truth": f"{digest_of_scene(truth.renderer.scene)} {truth.source} {self.upsampler}",
-            "recipe": f"{start.recipe.name} {start.recipe.digest}",
+            "recipe": " ".join(f"{recipe.name} {recipe.digest}" for recipe in self.recipes or [start.recipe]),
             "views": digest_of_cameras(self.views),
             "training cameras": digest_of_cameras(start.training.cameras),
             "photographs": digest_of_files(photos) if truth.source == "photographs" else "",
@@ -112,6 +115,11 @@ class State:
         if self.group is not None:
             scene, bounds = scene[self.group], bounds[self.group]
         return replace(job.start, scene=scene, training=replace(job.start.training, bounds=bounds))
+
+    def renderer_of_step(self, job: TuningJob) -> Renderer:
+        """The same, by the recipe of the next step."""
+        renderer = self.renderer(job)
+        return replace(renderer, recipe=job.recipes[self.step % len(job.recipes)]) if job.recipes else renderer
 
 
 def begin(job: TuningJob) -> State:

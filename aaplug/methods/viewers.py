@@ -45,6 +45,7 @@ class Viewer:
     floor: alpha below which a splat is not drawn at a pixel; 0: it has no such bound.
     smallest: px²; a splat whose variance along its longer axis, with what was added, is less is not drawn.
     apart: px²; least half difference of the variances along a splat's two axes, to which rounder ones are stretched.
+    shown_by: names of viewers that show its files by rules of their own; a scene is tuned for all of these rules.
     levels: how it chooses levels of detail, in words; empty: it draws none.
     formats: names of formats of the scene files that the program is known to open, of those that aaplug writes.
     spz_axes: in which it takes the numbers of a .spz; "auto": those of the specification.
@@ -64,6 +65,7 @@ class Viewer:
     floor: float = RULES_3DGS.min_alpha
     smallest: float = 0.0
     apart: float = 0.0
+    shown_by: tuple[str, ...] = ()
     levels: str = ""
     formats: tuple[str, ...] = ("ply",)
     spz_axes: SpzAxes = "auto"
@@ -169,7 +171,16 @@ VIEWERS: Registry[Viewer] = Registry(
             CLASSIC_VIEWER,
             Viewer("antialiased", "3DGS", ANTIALIASED, "--antialiasing", switched=True),
             MIP_VIEWER,
-            Viewer("khr", "glTF KHR_gaussian_splatting", KHR, NO_TAG, sh_degree=3, cut=3.0, formats=("glb", "gltf")),
+            Viewer(
+                "khr",
+                "glTF KHR_gaussian_splatting",
+                KHR,
+                NO_TAG,
+                sh_degree=3,
+                cut=3.0,
+                shown_by=("cesium", "babylon-classic"),
+                formats=("glb", "gltf"),
+            ),
             Viewer(
                 "usd", "OpenUSD 26.03's schema", KHR, NO_TAG, sh_degree=3, cut=3.0, formats=("usda", "usdc", "usdz")
             ),
