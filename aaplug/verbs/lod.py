@@ -64,7 +64,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
 
     Returns:
         The one scene; or all levels, first the scene itself.  With `to` and an output, their harmonics are NaN and
-        take no memory: they are in the files.
+        take no memory: they are in the files.  For "rad" they are as merged, and the file's tree is tuned.
 
     Raises:
         AaplugError: as `render`; also, the scene holds no Gaussians, or 2D ones and `viewer` or `to` is given.
