@@ -23,7 +23,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.monitor import SILENT, Monitor
 
 PARTS_OF_CHANGE = (0.5, 0.25, 0.125)  # towards the tuned scene, tried while a scale is worse than the original
-ROUNDING_ERROR = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 MAX_VIEWS = 8  # evenly spaced, that scenes are compared on
 ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report
 
@@ -60,7 +59,7 @@ def fit(
         monitor.say(f"{problem}: starting from the original")
         start = original
     psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
-    errors = {s: max(ROUNDING_ERROR, 0.0 if dB is None else 10 ** (-dB / 10)) for s, dB in psnr.items()}
+    errors = {s: 0.0 if dB is None else 10 ** (-dB / 10) for s, dB in psnr.items()}
     settings = balance(replace(SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS, steps=steps), errors)
     recipes = [recipe_of(v) for v in (viewer, *(VIEWERS[name] for name in viewer.shown_by))]
     job = TuningJob(start, original.training.cameras, truth, settings, recipes=recipes)

@@ -13,6 +13,7 @@ from aaplug.methods.viewers import FAST, Viewer
 from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
 from aaplug.system.errors import UsageError
 
+ROUNDING_ERROR = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 SEED_STRIDE = 10_000_019  # from one of the user's seeds to the next
 
 
@@ -56,11 +57,12 @@ SHARED_SETTINGS = replace(QUICK_SETTINGS, weights=LOSS_WEIGHTS, anchor=1.0)
 def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
     """Divide the weight of every scale by the root of the mean square error found there; errors[1.0] is the anchor's.
 
-    Undivided losses would sacrifice scales with small errors to those with large ones; losses as shares of the errors
-    would leave the large ones where they are.
+    Errors below that of rounding to 8 bits count as that.  Undivided losses would sacrifice scales with small errors to
+    those with large ones; losses as shares of the errors would leave the large ones where they are.
     """
-    weights = {scale: weight / errors[scale] ** 0.5 for scale, weight in settings.weights.items()}
-    return replace(settings, weights=weights, anchor=settings.anchor / errors[1.0] ** 0.5)
+    roots = {scale: max(ROUNDING_ERROR, error) ** 0.5 for scale, error in errors.items()}
+    weights = {scale: weight / roots[scale] for scale, weight in settings.weights.items()}
+    return replace(settings, weights=weights, anchor=settings.anchor / roots[1.0])
 
 
 def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:
