@@ -5,7 +5,6 @@ import io
 import math
 import re
 import sys
-from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -142,7 +141,8 @@ def test_a_refusal_has_no_frame_on_a_terminal_without_unicode(monkeypatch):
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_a_refusal_is_one_line(words, capsys):
+def test_a_refusal_is_one_line(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stop:
         main(words.split())
     printed = capsys.readouterr()
@@ -150,7 +150,7 @@ def test_a_refusal_is_one_line(words, capsys):
     assert printed.err.startswith("error: ")
     assert printed.err.count("\n") == 1, printed.err
     assert REFUSED[words] in printed.err
-    assert not Path("out").exists()
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("verb", VERBS)
