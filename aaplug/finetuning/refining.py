@@ -21,7 +21,7 @@ from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run, view_and_weights
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, TUNING_RATES, balance
-from aaplug.finetuning.state import State, TuningJob, begin
+from aaplug.finetuning.state import State, TuningJob, begin, part_of
 from aaplug.io.rad import node_sizes, shown_of
 from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
@@ -174,7 +174,7 @@ def _error(renderer: Renderer, truth: Truth, views: Sequence[Camera], rate: floa
     """Mean square error at a rate.  shown: the Gaussians that a view shows; None for all."""
     errors = []
     for view in views:
-        small, scene = view.scaled(rate), renderer.scene
-        drawing = renderer if shown is None else renderer.showing(scene[shown(scene, small)])
+        small = view.scaled(rate)
+        drawing = renderer if shown is None else part_of(renderer, shown(renderer.scene, small))
         errors.append(float((drawing(small).rgb.clamp(0, 1) - truth(view, rate)).square().mean()))
     return statistics.mean(errors)

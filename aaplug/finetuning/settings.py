@@ -50,7 +50,7 @@ CONSISTENCY_SETTINGS = Settings(
 QUICK_SETTINGS = replace(
     CONSISTENCY_SETTINGS, name="quick", steps=300, weights=dict.fromkeys(LOSS_WEIGHTS, 1.0), anchor=4.0
 )
-# For a file that several programs show by rules without compensation: none is right at all sizes, so all weigh alike
+# For a file that several programs show by rules without compensation: it cannot be right at all sizes
 SHARED_SETTINGS = replace(QUICK_SETTINGS, weights=LOSS_WEIGHTS, anchor=1.0)
 
 

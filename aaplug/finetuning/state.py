@@ -111,15 +111,20 @@ class State:
 
     def renderer(self, job: TuningJob) -> Renderer:
         """Draws the scene, or the group, as it is now; differentiable in the leaves."""
-        scene, bounds = scene_of(self.leaves, job.start.scene), self.bounds
-        if self.group is not None:
-            scene, bounds = scene[self.group], bounds[self.group]
-        return replace(job.start, scene=scene, training=replace(job.start.training, bounds=bounds))
+        scene, training = scene_of(self.leaves, job.start.scene), replace(job.start.training, bounds=self.bounds)
+        renderer = replace(job.start, scene=scene, training=training)
+        return renderer if self.group is None else part_of(renderer, self.group)
 
     def renderer_of_step(self, job: TuningJob) -> Renderer:
         """The same, by the recipe of the next step."""
         renderer = self.renderer(job)
         return replace(renderer, recipe=job.recipes[self.step % len(job.recipes)]) if job.recipes else renderer
+
+
+def part_of(renderer: Renderer, places: Int[Tensor, " k"]) -> Renderer:
+    """The same for some of its Gaussians, with their sampling bounds."""
+    training = replace(renderer.training, bounds=renderer.training.bounds[places])
+    return replace(renderer, scene=renderer.scene[places], training=training)
 
 
 def begin(job: TuningJob) -> State:
