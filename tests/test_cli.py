@@ -172,7 +172,9 @@ def test_broken_files_are_refused_and_nothing_is_written(cli, spoil, words, name
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_refusals_name_file_and_cause_and_write_nothing(cli, words):
+def test_refusals_name_file_and_cause_and_neither_draw_nor_write(cli, words, monkeypatch):
+    if "blender" not in words:  # its scales fit or not by the photograph's size, known when it is read
+        monkeypatch.setattr("aaplug.rendering.job.agreement", lambda *_: pytest.fail("drew before it refused"))
     cli.refused(words, *REFUSED[words])
 
 

@@ -157,12 +157,17 @@ class Job(Generic[O_co]):
                 self.monitor.say(f"{name.replace('_', ' ')} {value} is not for recipe {names}")
         return found
 
+    def fitted(self: "Job[RecipeOptions]", *recipes: str | Recipe) -> list[Recipe]:
+        """Recipes as `named`, fitted to the scene; raises UsageError if it lacks what one needs."""
+        gaussians, _ = without_harmonics(self.scene)
+        return [suited(recipe, gaussians) for recipe in self.named(*recipes)]
+
     def recipes(self: "Job[RecipeOptions]", names: str | Recipe | Sequence[str | Recipe]) -> list[Recipe]:
-        """Recipes as `named`, fitted to the scene; of "all", those that it has everything for."""
-        gaussians, names = self.scene.gaussians(), [names] if isinstance(names, str | Recipe) else names
+        """Recipes as `fitted`; of "all", those that the scene has everything for."""
+        names = [names] if isinstance(names, str | Recipe) else names
         if ALL not in names:
-            return [suited(recipe, gaussians) for recipe in self.named(*names)]
-        recipes = self.named(*RECIPES)
+            return self.fitted(*names)
+        (gaussians, _), recipes = without_harmonics(self.scene), self.named(*RECIPES)
         lacks = {recipe.name: recipe.lacks(gaussians) for recipe in recipes}
         for name, lack in lacks.items():
             if lack is not None:

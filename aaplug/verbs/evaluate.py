@@ -63,9 +63,10 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         if options.poses:
             job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views)[0])
             views = job.views
-        look = job.look(frames)
+        look = job.look(frames, check=False)
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
+        job.check_fit(look)
         job.announce(task.renderers, task.sized_views, cost=task.cost)
         job.say_assumed(look)
         choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}

@@ -50,10 +50,11 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     ends = select_views(job.cameras, options.camera_to, "camera_to") if options.camera_to else ()
     shown = path or CameraPath(job.views, unsized=job.cameras.assumed)
     views = [view for eyes in zip(*drawn(job, shown, path is not None, ends), strict=True) for view in eyes]
+    [recipe] = job.fitted(options.recipe)
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
-        renderer = job.look(len(views)).by(*job.named(options.recipe))
+        renderer = job.look(len(views)).by(recipe)
         job.monitor.say(description(renderer, views))
         job.announce([renderer], views, processes=workers.threads)
         job.say_assumed(renderer, views[0])

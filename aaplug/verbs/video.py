@@ -81,7 +81,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         check()
     job = Job.of(scene, cameras, options)
     beside = "none" if alone or options.beside is None else options.beside
-    recipes = job.named(*(name for name in (beside, options.recipe) if name != "none"))
+    recipes = job.fitted(*(name for name in (beside, options.recipe) if name != "none"))
     path = file or CameraPath(tuple(_built_in_path(job, fps)), unsized=job.cameras.assumed)
     eyes = drawn(job, path, True)
     views = eyes[0]
