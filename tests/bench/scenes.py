@@ -4,15 +4,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import BLACK, WHITE
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.imaging import quantised
+from aaplug.core.projection import rotation_matrices
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_cameras
@@ -22,6 +25,7 @@ from aaplug.rendering.renderer import Renderer
 from tests.conftest import SHARED_DATA
 
 TEST_VIEWS = 4
+PART_VARIANCE = 0.25  # of a split Gaussian's part, against its own
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,26 @@ def trained(name: str) -> Trained:
     path = SHARED_DATA / checkpoint.file
     cameras = path.parent if checkpoint.cameras is None else SHARED_DATA / checkpoint.cameras
     return Trained(read_scene(path).gaussians(), read_cameras(cameras, train_scale=checkpoint.scale), checkpoint)
+
+
+def split(scene: Gaussians) -> Gaussians:
+    """Each Gaussian as 20 smaller ones that together keep its mean, its covariance and, where it is faint, its light.
+
+    They lie at the corners of a dodecahedron in the frame where the Gaussian is a unit ball.
+    """
+    golden = (1 + math.sqrt(5)) / 2
+    sides = [(0.0, y / golden, z * golden) for y, z in product((1, -1), repeat=2)]
+    turned = (side[i:] + side[:i] for side in sides for i in range(3))
+    corners = torch.tensor([*product((1.0, -1.0), repeat=3), *turned])
+    corners *= math.sqrt(1 - PART_VARIANCE)  # their mean square along each axis is 1
+    parts = scene[torch.arange(len(scene)).repeat_interleave(len(corners))]
+    offsets = parts.scales * corners.repeat(len(scene), 1)
+    return replace(
+        parts,
+        means=parts.means + torch.einsum("nij,nj->ni", rotation_matrices(parts.unit_quats), offsets),
+        log_scales=parts.log_scales + math.log(PART_VARIANCE) / 2,
+        logit_opacities=torch.logit(parts.opacities / (len(corners) * PART_VARIANCE), eps=MIN_OPACITY),
+    )
 
 
 def decibels(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:

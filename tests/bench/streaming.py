@@ -32,7 +32,7 @@ from aaplug.core.sampling import median_rates
 from aaplug.io import StreamName
 from aaplug.io.scenes import write_scene
 from aaplug.io.streamed import SETTINGS, STREAMS, write_index, write_level
-from tests.bench import heading, row
+from tests.bench import heading, row, scenes
 from tests.bench.scenes import decibels
 from tests.bench.viewers import shoot
 
@@ -54,6 +54,7 @@ def main(
     steps: int | None = None,
     views: int = 2,
     frames: int = 120,
+    split: bool = False,
 ) -> None:
     """Print the table.
 
@@ -68,9 +69,13 @@ def main(
         steps: of the tuning, as there.
         views: their number.
         frames: of the camera that moves out; 0 for none.
+        split: each Gaussian into 20, for a large scene that looks alike.
     """
     heading("streaming", "streamed", "levels", *(f"1/{1 / scale:g}" for scale in SCALES), "largest change")
     whole, data = aaplug.read_scene(scene).gaussians(), aaplug.read_cameras(cameras)
+    if split:
+        whole, scene = scenes.split(whole), work / "split.ply"
+        write_scene(scene, whole, overwrite=True)
     seen = data.test[:: max(1, len(data.test) // views)][:views]
     look = aaplug.Renderer.of(whole, data, "classic", background=WHITE)
     truths = {view.name: look(view).rgb for view in seen}
