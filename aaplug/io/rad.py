@@ -12,12 +12,11 @@ than a pixel: see `node_sizes`.
 import json
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -95,17 +94,13 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
     scene = joined([scene, replace(above, means=means[len(scene) :], **shape)])
     counts = torch.bincount(parents + 1, minlength=len(scene) + 1)[1:]
     siblings = torch.argsort(parents, stable=True)  # first the root, then the children of each
-    firsts = 1 + starts_of(counts)  # among the siblings
-    order, starts, below = [siblings[:1]], list[Tensor](), 1
-    while len(order[-1]):  # the root, its children, theirs
-        count = counts[order[-1]]
-        ends = count.cumsum(0)
-        starts.append(below + ends - count)
-        below += int(ends[-1])
-        first = (firsts[order[-1]] - ends + count).repeat_interleave(count)
+    firsts, order = 1 + starts_of(counts), [siblings[:1]]  # the first children's places among the siblings
+    while len(above := order[-1]):  # the root, its children, theirs
+        first = (firsts[above] - starts_of(counts[above])).repeat_interleave(counts[above])
         order.append(siblings[first + torch.arange(len(first))])
     along = torch.cat(order)
-    return Tree(scene[along], counts[along], torch.cat(starts) * counts[along].sign())
+    counts = counts[along]
+    return Tree(scene[along], counts, (1 + starts_of(counts)) * counts.sign())
 
 
 def _crowded(parents: Int[Tensor, " n"]) -> int | None:
@@ -139,38 +134,37 @@ def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
 
 def _chunk(tree: Tree, facts: Mapping[str, Any], base: int) -> bytes:
     """The chunk of the Gaussians from `base` on."""
-    payload, entries = bytearray(), []
+    payload, entries, spans = bytearray(), [], facts["splatEncoding"]
     rows = slice(base, base + CHUNK_GAUSSIANS)
     part = Tree(tree.scene[rows], tree.counts[rows], tree.starts[rows])
-    for about, values in _properties(part, facts["splatEncoding"]):
-        data = zlib.compress(values.tobytes(), DEFLATE_LEVEL, RAW_DEFLATE)
-        entries.append({"offset": len(payload), "bytes": len(data), "compression": "gz", **about})
+    for name, (encoding, values) in _properties(part, spans).items():
+        data = zlib.compress(values.t().contiguous().numpy().tobytes(), DEFLATE_LEVEL, RAW_DEFLATE)
+        ends = {"min": -spans[f"{name}Max"], "max": spans[f"{name}Max"]} if encoding == "s8" else {}
+        about = {"offset": len(payload), "bytes": len(data), "compression": "gz", "property": name}
+        entries.append({**about, "encoding": encoding, **ends})
         payload += data + bytes(-len(data) % ALIGNMENT)
     about = {"base": base, "count": len(part.scene), "payloadBytes": len(payload), "properties": entries}
     return _headed(b"RADC", dict(facts) | about) + struct.pack("<Q", len(payload)) + payload
 
 
-def _properties(tree: Tree, spans: Mapping[str, float]) -> Iterator[tuple[dict[str, Any], "np.ndarray[Any, Any]"]]:
-    """Name and encoding of each property, and its values, one row a component."""
-
-    def property_of(name: str, encoding: str, values: Tensor) -> tuple[dict[str, Any], "np.ndarray[Any, Any]"]:
-        return {"property": name, "encoding": encoding}, values.t().contiguous().numpy()
-
+def _properties(tree: Tree, spans: Mapping[str, float]) -> dict[str, tuple[str, Tensor]]:
+    """Encoding and values of each property, by name."""
     scene, half, quats = tree.scene, torch.float16, tree.scene.unit_quats
-    bytes_apart = scene.means.float().t().flatten().view(torch.uint8).view(-1, 4)  # of each float the lowest first
-    yield property_of("center", "f32_lebytes", bytes_apart)
-    yield property_of("alpha", "f16", scene.opacities.to(half))
-    yield property_of("rgb", "f16", scene.base_colours.to(half))
-    yield property_of("scales", "ln_f16", scene.log_scales.to(half))
     upper = quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)  # w is the rest
-    yield property_of("orientation", "f32", upper.float())
+    properties = {
+        "center": ("f32_lebytes", scene.means.float().t().flatten().view(torch.uint8).view(-1, 4)),  # the lowest first
+        "alpha": ("f16", scene.opacities.to(half)),
+        "rgb": ("f16", scene.base_colours.to(half)),
+        "scales": ("ln_f16", scene.log_scales.to(half)),
+        "orientation": ("f32", upper.float()),
+    }
     for band, coefficients in enumerate(BANDS, 1):
         if (span := spans.get(f"sh{band}Max")) is not None:
             values = (scene.sh[:, coefficients].flatten(1) * (MAX_S8 / span)).round().clamp(-MAX_S8, MAX_S8)
-            about, array = property_of(f"sh{band}", "s8", values.to(torch.int8))
-            yield about | {"min": -span, "max": span}, array
-    yield {"property": "child_count", "encoding": "u16"}, tree.counts.numpy().astype("<u2")
-    yield {"property": "child_start", "encoding": "u32"}, tree.starts.numpy().astype("<u4")
+            properties[f"sh{band}"] = "s8", values.to(torch.int8)
+    properties["child_count"] = "u16", tree.counts.to(torch.uint16)
+    properties["child_start"] = "u32", tree.starts.to(torch.uint32)
+    return properties
 
 
 def _quantile(values: Tensor, share: float) -> float:

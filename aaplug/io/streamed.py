@@ -12,7 +12,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -56,7 +56,8 @@ THREE = (
 TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
 SETTINGS, PAGE, ORBIT = "settings.json", "index.html", "orbit.js"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
-FACTS = 7  # numbers that tell of a part: its size and its box
+FACTS = 7  # numbers that tell of a part: its Gaussians, and the smallest and largest coordinates
+NOTHING = [0.0, *[math.inf] * 3, *[-math.inf] * 3]  # of an empty part
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ def write_index(
     if tree is not None:
         content, settings = rad_of(tree_of(tree.scene, tree.parents)), _spark_settings(tree)
     else:
-        parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
+        parts = torch.tensor([_read_parts(facts_file(folder, n)) for n in range(levels)], dtype=torch.float64)
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
         content = _json(index)
         if name == "sog":
@@ -234,13 +235,11 @@ def _json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=1).encode()
 
 
-def _read_parts(path: Path) -> list["_Part"]:
+def _read_parts(path: Path) -> list[list[float]]:
     """The facts that `write_level` wrote about a level's parts."""
     document, place = read_json(path), Place(path, "the file")
     place.expect(isinstance(document, list), "it", "a list of parts", document)
-    facts = [numbers(fact, FACTS if fact else 0, place, "a part") for fact in document]
-    boxes = [torch.tensor(fact[1:], dtype=torch.float64).view(-1, 3) for fact in facts]
-    return [_Part(int(fact[0]), box) if fact else NOTHING for fact, box in zip(facts, boxes, strict=True)]
+    return [numbers(fact, FACTS, place, "a part") if fact else NOTHING for fact in document]
 
 
 def programs_of(name: StreamName, modules: Path) -> list[Path]:
@@ -271,27 +270,19 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
         write_file(folder / file, files(stream_pages).joinpath(source).read_bytes(), overwrite=True)
 
 
-class _Part(NamedTuple):
-    """An index's facts about a part.  size: its Gaussians.  box: empty where the part is."""
-
-    size: int
-    box: Box
-
-
-NOTHING = _Part(0, torch.tensor(((math.inf,) * 3, (-math.inf,) * 3), dtype=torch.float64))
 Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's settings
 
 
-def _lod_meta(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> Indexed:
-    counts, filenames, children = [sum(part.size for part in level) for level in parts], [], []
-    for leaf, levels in enumerate(zip(*parts, strict=True)):
+def _lod_meta(stream: Stream, parts: Float[Tensor, "levels leaves 7"], rate: float) -> Indexed:
+    counts, filenames, children = parts[..., 0].sum(dim=1).long().tolist(), [], []
+    for leaf, levels in enumerate(parts.unbind(dim=1)):
         lods = {}
         for number, part in enumerate(levels):
-            if part.size:
-                lods[str(number)] = {"file": len(filenames), "offset": 0, "count": part.size}
+            if part[0]:
+                lods[str(number)] = {"file": len(filenames), "offset": 0, "count": int(part[0])}
                 filenames.append(stream.part(number, leaf))
         children.append({"bound": _bound(_box(levels)), "lods": lods})
-    tree = {"bound": _bound(_box([part for level in parts for part in level])), "children": children}
+    tree = {"bound": _bound(_box(parts)), "children": children}
     facts = {"version": 1, "asset": {"generator": "aaplug"}, "count": counts[0], "counts": counts}
     settings = {
         "app.scene.gsplat": {"antiAlias": True, "splatBudgetMode": "limit", "splatBudget": 0},
@@ -302,15 +293,15 @@ def _lod_meta(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> 
     return facts | {"lodLevels": len(counts), "filenames": filenames, "tree": tree}, settings
 
 
-def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> Indexed:
+def _tileset(stream: Stream, parts: Float[Tensor, "levels leaves 7"], rate: float) -> Indexed:
     def error(number: int) -> float:
         return MAX_SCREEN_ERROR * 2.0**number / (TILE_SWITCH * rate)
 
     tiles = []
-    for leaf, levels in enumerate(zip(*parts, strict=True)):
+    for leaf, levels in enumerate(parts.unbind(dim=1)):
         volume, tile = _volume(_box(levels)), None
         for number, part in enumerate(levels):
-            if part.size:
+            if part[0]:
                 finer = {} if tile is None else {"children": [tile]}
                 content = {"content": {"uri": stream.part(number, leaf)}}
                 about = {"boundingVolume": volume, "geometricError": error(number) if finer else 0.0}
@@ -318,13 +309,13 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
         tiles.append(tile)
     root = {
         "transform": torch.eye(4).flatten().tolist(),
-        "boundingVolume": _volume(_box([part for level in parts for part in level])),
+        "boundingVolume": _volume(_box(parts)),
         "geometricError": ALWAYS * error(len(parts) - 1),
         "refine": "REPLACE",
         "children": tiles,
     }
     extension = {"extensionsUsed": SPLATS, "extensionsRequired": SPLATS}
-    counts = [sum(part.size for part in level) for level in parts]
+    counts = parts[..., 0].sum(dim=1).long().tolist()
     index = {
         "asset": {"version": "1.1", "generator": "aaplug", "extras": {"counts": counts}},
         "extensionsUsed": ["3DTILES_content_gltf"],
@@ -343,10 +334,9 @@ def _spark_settings(front: Front) -> dict[str, Any]:
     return {"SparkRenderer": blur | budget}
 
 
-def _box(parts: Sequence[_Part]) -> Box:
+def _box(parts: Float[Tensor, "*n 7"]) -> Box:
     """The box around the boxes of parts."""
-    lows, highs = torch.stack([part.box for part in parts]).unbind(dim=1)
-    return torch.stack([lows.amin(dim=0), highs.amax(dim=0)])
+    return torch.stack([parts[..., 1:4].reshape(-1, 3).amin(dim=0), parts[..., 4:].reshape(-1, 3).amax(dim=0)])
 
 
 def _bound(box: Box) -> dict[str, list[float]]:
