@@ -205,7 +205,7 @@ def test_what_is_written_is_read_within_steps_and_written_again_as_it_is(
     (tmp_path / "again").mkdir()
     first, second = tmp_path / f"a.{name}", tmp_path / "again" / f"a.{name}"
     if name == "meta.json":
-        first, second = tmp_path / name, tmp_path / "again" / name
+        first, second = tmp_path / name, tmp_path / "again" / name.upper()
     write_scene(first, scene)
     again = read_scene(first).gaussians()
     assert (len(again), again.sh_degree) == (len(scene), 0 if name == "splat" else degree)

@@ -75,14 +75,12 @@ class Part:
     pixels: list[np.ndarray]
     width: int
 
-    def between(self, channels: int, rows: slice) -> Float[Tensor, "n c"]:
-        """Version 1: bytes as fractions from mins to maxs."""
-        low, high = (self.entry.vector(key, channels).float() for key in ("mins", "maxs"))
-        return torch.lerp(low, high, floats(self.pixels[0][rows, :channels]) / 255)
-
-    def coded(self, pixels: np.ndarray) -> Float[Tensor, "*n 3"]:
-        """Version 2: bytes as indices into the codebook."""
-        return self.entry.vector("codebook", 256).float()[torch.from_numpy(pixels.astype(np.int64))]
+    def values(self, pixels: np.ndarray, version: int) -> Float[Tensor, "*n c"]:
+        """Bytes as indices into the codebook, or in version 1 as fractions from mins to maxs."""
+        if version > 1:
+            return self.entry.vector("codebook", 256).float()[torch.from_numpy(pixels.astype(np.int64))]
+        low, high = (self.entry.vector(key, pixels.shape[1]).float() for key in ("mins", "maxs"))
+        return torch.lerp(low, high, floats(pixels) / 255)
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -103,7 +101,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
 
 
 def _is_meta(path: Path) -> bool:
-    return f".{path.name}".endswith(f".{META}")
+    return f".{path.name.lower()}".endswith(f".{META}")
 
 
 def _from_folder(path: Path, file: str, most: int) -> bytes:
@@ -135,11 +133,8 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
     value = value[0] if isinstance(value, list) and value else value
     count = natural(value, root.place, "count", MAX_COUNT)
     check_count(path, count)
-    used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
+    used = ["means", "quats", "scales", "sh0", *["shN"] * bool(meta.get("shN"))]
     parts = {key: _part(path, root, key, count, fetch) for key in used}
-    lacking = [key for key in ("means", "quats", "scales", "sh0") if key not in parts]
-    if lacking:
-        raise root.place.error(f"{lacking[0]} is missing")
     palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
     facts = read_record(path, meta, _meaning(meta))
@@ -197,7 +192,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
         raise part.entry.place.error(f"the palette's image is {part.width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
     if version > 1:
-        return part.coded(pixels)
+        return part.values(pixels, version)
     low, high = (part.entry.get(key, number) for key in ("mins", "maxs"))
     return floats(pixels) / 255 * (high - low) + low
 
@@ -207,18 +202,11 @@ def _rows(
 ) -> Gaussians:
     rows = slice(start, stop)
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
-    alpha = sh0.pixels[0][rows, 3]
-    if version > 1:
-        log_scales, colours, logits = (
-            scales.coded(scales.pixels[0][rows, :3]),
-            sh0.coded(sh0.pixels[0][rows, :3]),
-            byte_opacities(alpha),
-        )
-    else:
-        log_scales, both = scales.between(3, rows), sh0.between(4, rows)
-        colours, logits = both[:, :3], both[:, 3]
-    sh = torch.zeros(len(alpha), 1 + palette.shape[1], 3)
-    sh[:, 0] = colours
+    log_scales = scales.values(scales.pixels[0][rows, :3], version)
+    colours = sh0.values(sh0.pixels[0][rows, : 3 if version > 1 else 4], version)
+    logits = byte_opacities(sh0.pixels[0][rows, 3]) if version > 1 else colours[:, 3]
+    sh = torch.zeros(len(logits), 1 + palette.shape[1], 3)
+    sh[:, 0] = colours[:, :3]
     if "shN" in parts:
         labels = parts["shN"].pixels[1][rows].astype(np.int64)
         index = torch.from_numpy(labels[:, 0] + 256 * labels[:, 1])
@@ -248,8 +236,11 @@ def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
-    """Write one .sog, a zip of meta.json and the images."""
+    """Write one .sog, a zip of meta.json and the images; or a meta.json with the images beside it."""
     meta, images = encoded(path, parts)
+    if _is_meta(path):
+        replacing_group(path, images, partial(_json, meta), overwrite)
+        return
     with replacing(path, overwrite) as stream, zipfile.ZipFile(stream, "w") as archive:
         for file, content in {**images, META: _json(meta, {file: file for file in images})}.items():
             archive.writestr(zipfile.ZipInfo(file), content)
@@ -259,18 +250,11 @@ class _Unbundled:
     """The meta.json of a folder; it is read as `sog`."""
 
     name, needs, read_as = META, None, name
+    open_scene, write = staticmethod(open_scene), staticmethod(write)
 
-    def sniff(self, path: Path, head: bytes) -> bool:
+    @staticmethod
+    def sniff(path: Path, head: bytes) -> bool:
         return False
-
-    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
-        return open_scene(path, options)
-
-    def write(
-        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
-    ) -> None:
-        meta, images = encoded(path, parts)
-        replacing_group(path, images, partial(_json, meta), overwrite)
 
 
 UNBUNDLED = _Unbundled()
