@@ -123,13 +123,7 @@ class Header:
         added = [f"comment {comment}" for comment in comments]
         return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
-    def with_padded_count(self, count: int) -> "Header":
-        """The header with fewer vertices and the same size: spaces replace lost digits."""
-        old = str(self.vertex.count)
-        lines = (re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x) for x in self.lines)
-        return parse(self.path, lines, self.newline)
-
-    def rewritten(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
+    def rewritten(self, count: int | str, dropped: Collection[str] = (), added: Iterable[str] = ()) -> "Header":
         """The header of a little-endian file with `count` vertices, without some columns, with others (float) added."""
         lines: list[str] = []
         inside = False

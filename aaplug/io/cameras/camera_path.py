@@ -7,8 +7,8 @@ add-on for Blender adds shutter, a share of the time between frames, and to a fr
 """
 
 import math
-import os
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
@@ -26,6 +26,7 @@ MAX_ANGLE = 180.0  # degrees: the angle of view of a pinhole is less
 
 name = "camera_path"
 sign = "a JSON file with camera_path (nerfstudio)"
+sniff = partial(mentions, keys=[KEY, "camera_to_world"])
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,6 @@ class CameraPath:
     fps: float | None = None
     shutter: float | None = None
     unsized: bool = False
-
-
-def sniff(path: Path) -> bool:
-    """True for a file with the keys of a camera path."""
-    return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
 
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:

@@ -4,6 +4,7 @@
 world_to_camera is 4×4, row by row, OpenCV axes.
 """
 
+from functools import partial
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, numbered
@@ -14,11 +15,7 @@ from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, re
 
 name = "pinhole"
 sign = "a JSON file with world_to_camera"
-
-
-def sniff(path: Path) -> bool:
-    """True for a file with the key world_to_camera."""
-    return mentions(path, ["world_to_camera"])
+sniff = partial(mentions, keys=["world_to_camera"])
 
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:

@@ -10,6 +10,7 @@ slopes to the neighbours, times smoothness; looping tracks go from the last key 
 the sources, not documented, and may change.
 """
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -26,10 +27,7 @@ WORLD = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)  # signs of the sce
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 FOV = 60.0  # degrees, if nothing says
 
-
-def sniff(path: Path) -> bool:
-    """True for a file with animations."""
-    return mentions(path, ["animTracks"])
+sniff = partial(mentions, keys=["animTracks"])
 
 
 def path_of(path: Path, fps: float | None = None) -> CameraPath:

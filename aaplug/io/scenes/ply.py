@@ -85,10 +85,10 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
         stream.write(document.bytes_of(document.after))
-        if written != count:  # rows were left out: the number has no more digits than before
+        if written != count:  # rows were left out: spaces replace digits that the number lost
             assert written < count
             stream.seek(0)
-            stream.write(header.with_padded_count(written).content)
+            stream.write(header.rewritten(f"{written:>{len(str(count))}}").content)
 
 
 def beside(scene: Gaussians) -> str:
@@ -184,10 +184,8 @@ def _matrix(rows: np.ndarray, names: Sequence[str]) -> Float[Tensor, "n c"]:
 
 def _plain_header(scene: Gaussians) -> Header:
     """The header that 3DGS writes, with its order of columns."""
-    rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
-    order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
-    columns = (*NORMALS, *matrix_of(scene[:0])[0])
-    properties = [f"property float {c}" for c in (*(c for c in order if c in columns), *scene.extras)]
+    names = [column for column in matrix_of(scene[:0])[0] if column != FILTER_COLUMN]  # `_header` adds that
+    properties = [f"property float {c}" for c in (*names[:3], *NORMALS, *names[3:], *scene.extras)]
     start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
     return parse("scene", [*start, *properties, "end_header"], "\n")
 
