@@ -16,7 +16,7 @@ from torch import Tensor
 
 from aaplug.core.imaging import linear, straight
 from aaplug.core.passes import PASSES
-from aaplug.io.atomic import AnyPath, replacing, replacing_file
+from aaplug.io.atomic import AnyPath, replacing, replacing_file, write_file
 from aaplug.io.image_formats import COLOURS, Storage
 from aaplug.io.images import encoded
 from aaplug.system.contracts import contract
@@ -45,14 +45,12 @@ def write_layers(
         chosen["rgb"] = linear(rgb) if alpha is None else linear(straight(rgb, alpha)) * alpha[..., None]
     if storage.format.name == "exr":
         _write_exr(path, chosen, storage, overwrite)
-        return
-    file = b"" if storage.format.name == "npz" else _picture(chosen, storage)
-    with replacing(path, overwrite) as stream:
-        if file:
-            stream.write(file)
-        else:
-            arrays: dict[str, Any] = {name: layer.numpy() for name, layer in chosen.items()}
+    elif storage.format.name == "npz":
+        arrays: dict[str, Any] = {name: layer.numpy() for name, layer in chosen.items()}
+        with replacing(path, overwrite) as stream:
             np.savez(stream, colorSpace=COLOURS[storage.colour], **arrays)
+    else:
+        write_file(path, _picture(chosen, storage), overwrite)
 
 
 def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -> bytes:

@@ -27,21 +27,9 @@ from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
-from aaplug.io.images import PNG_SIGNATURE, image_size
+from aaplug.io.images import image_size, is_png_with_alpha
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
-from aaplug.io.values import (
-    Entry,
-    Place,
-    entries,
-    focal,
-    mentions,
-    number,
-    object_of,
-    pixels,
-    read_json,
-    read_start,
-    text,
-)
+from aaplug.io.values import Entry, Place, entries, focal, mentions, number, object_of, pixels, read_json, text
 from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
@@ -54,8 +42,6 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 MIN_ANGLE = 1e-9  # rad: the smallest angle of view
 FILE_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's split
 MASK = "mask_path"
-PNG_COLOUR_TYPE = 25  # byte of the header
-PNG_ALPHA = (b"\4", b"\6")  # colour types with alpha: gray and RGB
 DATAPARSER = "dataparser_transforms.json"
 
 Dataparser = tuple[Float[Tensor, "4 4"], float]  # a rigid motion, followed by a scale
@@ -101,8 +87,7 @@ def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet
     else:
         cameras = sorted(cameras, key=lambda camera: camera.name) if options.test_every else cameras
         split = sets.every_nth(cameras, options, 0, reason)
-    headers = (read_start(camera.photo, PNG_COLOUR_TYPE + 1) for camera in source.cameras if camera.photo)
-    alpha = any(h.startswith(PNG_SIGNATURE) and h[PNG_COLOUR_TYPE:] in PNG_ALPHA for h in headers)
+    alpha = any(is_png_with_alpha(camera.photo) for camera in source.cameras if camera.photo)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
     background = WHITE if alpha else None
     return sets.camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])

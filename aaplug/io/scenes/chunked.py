@@ -44,13 +44,11 @@ class Chunks:
         if not file.resolve().is_relative_to(self.path.parent.resolve()):
             raise FormatError(self.path, f"names {name!r}, which leads out of its folder")
         head = read_start(file, HEAD_BYTES)
-        if sog.sniff(file, head):
-            self.opened[name] = sog.open_scene(file, self.options)
-        elif spz.sniff(file, head):
-            axes = "opencv" if self.options.spz_axes == "auto" else self.options.spz_axes  # SOGs' in such an index
-            self.opened[name] = spz.open_scene(file, replace(self.options, spz_axes=axes))
-        else:
+        format = next((each for each in (sog, spz) if each.sniff(file, head)), None)
+        if format is None:
             raise FormatError(self.path, f"names {name!r}, which is neither a SOG nor a .spz")
+        axes = "opencv" if self.options.spz_axes == "auto" else self.options.spz_axes  # SOGs' in such an index
+        self.opened[name] = format.open_scene(file, replace(self.options, spz_axes=axes))
         return self.opened[name]
 
     def rows(self, names: list[str], entry: Entry, key: str, start: str) -> Piece:

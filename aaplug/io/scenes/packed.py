@@ -118,9 +118,7 @@ def replacing_group(
         write_file(path.with_name(names[plain]), content, overwrite=True)
     write_file(path, whole(names), overwrite)
     stale = {json.dumps(file.name).strip('"').encode(): file for file in earlier if file.name not in names.values()}
-    for other in path.parent.glob(f"*{path.suffix}") if stale else ():
-        if other == path or not other.is_file():
-            continue
+    for other in filter(Path.is_file, path.parent.glob(f"*{path.suffix}") if stale else ()):
         try:
             content = other.read_bytes()
         except OSError:  # nobody knows what it names

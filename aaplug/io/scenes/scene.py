@@ -331,27 +331,21 @@ def probes(count: int, each: int) -> list[range]:
     return [range(start, min(start + each, count)) for start in range(0, count, step)]
 
 
-@dataclass(frozen=True)
-class FileHarmonics:
-    """Reads the harmonics of Gaussians from start up to stop; raises FormatError if the file has changed.
+def harmonics_in_file(
+    path: Path, load: Callable[[int, int], Gaussians], rows: Int[Tensor, " n"], start: int, stop: int
+) -> Float[Tensor, "c k 3"]:
+    """Harmonics as stored, of Gaussians from start up to stop; raises FormatError if the file has changed.
 
     path: the scene's file.  load: see `Scene`.  rows: the file's row of each Gaussian, increasing.
     """
-
-    path: Path
-    load: Callable[[int, int], Gaussians]
-    rows: Int[Tensor, " n"]
-
-    def __call__(self, start: int, stop: int) -> Float[Tensor, "c k 3"]:
-        """Harmonics as stored."""
-        rows = self.rows[start:stop]
-        first, end = int(rows[0]), int(rows[-1]) + 1
-        with library_errors(self.path):
-            harmonics = self.load(first, end).sh
-        return harmonics if end - first == len(rows) else harmonics[rows - first]
+    rows = rows[start:stop]
+    first, end = int(rows[0]), int(rows[-1]) + 1
+    with library_errors(path):
+        harmonics = load(first, end).sh
+    return harmonics if end - first == len(rows) else harmonics[rows - first]
 
 
-def without_harmonics(scene: Scene) -> tuple[Gaussians, FileHarmonics | None]:
+def without_harmonics(scene: Scene) -> tuple[Gaussians, Callable[[int, int], Tensor] | None]:
     """The scene's Gaussians, and what reads their harmonics where these are large and stay in the file; else None.
 
     `sh` then has its shape but is NaN and takes no memory.  All values are checked, the harmonics too, part by part.
@@ -367,5 +361,6 @@ def without_harmonics(scene: Scene) -> tuple[Gaussians, FileHarmonics | None]:
         bare = joined([replace(part, sh=nothing.expand(len(part), 1, 3)) for part in scene.parts()])
         assert bare.origin is not None
         nothing = nothing.expand(len(bare), (scene.sh_degree + 1) ** 2, 3)
-        scene.memory["without harmonics"] = replace(bare, sh=nothing), FileHarmonics(path, scene.load, bare.origin.rows)
+        harmonics = partial(harmonics_in_file, path, scene.load, bare.origin.rows)
+        scene.memory["without harmonics"] = replace(bare, sh=nothing), harmonics
     return scene.memory["without harmonics"]
