@@ -35,6 +35,8 @@ COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")
 ELEVEN_TEN_ELEVEN, COMPONENTS = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10))
 CHUNK_LENGTH = 256  # Gaussians
 SH_SPAN = 8.0  # harmonics lie between -4 and 4
+# by byte: the centres of 256 steps, but of the first and the last byte the ends
+HARMONICS = (np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256, [1.0]]) - 0.5).astype(np.float32) * SH_SPAN
 MOST_DEGREE = 3
 LARGEST_LOG_SCALE = 20.0  # absolute: a wider chunk of log-scales would leave its steps too coarse
 
@@ -102,7 +104,7 @@ def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int,
     if rest is not None:
         k = sh.shape[1] - 1
         for i in range(3 * k):
-            sh[:, 1 + i % k, i // k] = _harmonic(rest[f"f_rest_{i}"])
+            sh[:, 1 + i % k, i // k] = torch.from_numpy(HARMONICS[rest[f"f_rest_{i}"]])
     means = _between(bounds, BOUNDS, of_row, fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
     scales = _between(bounds, SCALE_BOUNDS, of_row, fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
     quats = word_quats(words["packed_rotation"], *COMPONENTS)
@@ -114,13 +116,6 @@ def _between(
 ) -> Float[Tensor, "n 3"]:
     ends = torch.from_numpy(np.stack([bounds[c][of_row] for c in names], axis=1))
     return torch.lerp(ends[:, :3], ends[:, 3:], share)
-
-
-def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:
-    """Bytes stand for the centres of 256 steps, the first and the last byte for the ends of the range."""
-    steps = torch.from_numpy(values).float()
-    share = torch.where(steps == 0, 0.0, torch.where(steps == 255, 1.0, (steps + 0.5) / 256))
-    return (share - 0.5) * SH_SPAN
 
 
 # Writing
