@@ -363,13 +363,7 @@ def view(words: Words) -> Answer:
         scene, cameras = read_inputs(words)
     command = [word for options in SCENE_AND_CAMERAS for word in words.given(options)]
     command += [] if words.background == "auto" else ["--background", words.background]
-    from aaplug.verbs.view import attend, serving
-
-    with serving(scene, cameras, words=command, **told(words, verbs.LiveOptions)) as address:
-        try:
-            attend(address, TERMINAL, words.no_browser)
-        except KeyboardInterrupt:  # the usual end
-            say("closed")
+    aaplug.view(scene, cameras, words=command, **told(words, verbs.LiveOptions))
     return Answer(None)
 
 

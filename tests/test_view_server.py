@@ -16,8 +16,7 @@ import torch
 from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
-from aaplug.system.monitor import SILENT
-from aaplug.verbs.view import attend, serving, view
+from aaplug.verbs.view import serving, view
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
 
 # ------------------------------------------------------------------------------------------------------- the messages
@@ -234,23 +233,17 @@ def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
     assert err.splitlines()[-1] == "closed"
 
 
-def test_without_a_scene_the_sample_opens(monkeypatch):
-    opened = []
-    monkeypatch.setattr("aaplug.verbs.view.attend", lambda address, *_: opened.append(address))
-    view(port=0)
-    assert opened[0].startswith("http://127.0.0.1:")
-
-
-def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
+def test_a_browser_in_the_terminal_is_not_opened_and_without_a_scene_the_sample_is_seen(monkeypatch):
     opened = []
     monkeypatch.setattr(
         "aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
     )
     for browser in (webbrowser.GenericBrowser("lynx"), SimpleNamespace(open=opened.append)):
         monkeypatch.setattr(webbrowser, "get", lambda chosen=browser: chosen)
-        attend("http://there/", SILENT, no_browser=False)
-    attend("http://there/", SILENT, no_browser=True)
-    assert opened == ["http://there/"]
+        view(port=0)
+    view(port=0, no_browser=True)
+    [address] = opened
+    assert address.startswith("http://127.0.0.1:")
 
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):  # noqa: F811

@@ -106,24 +106,28 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         elif frames is not None:
             return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
         elif path and job.scene.path and job.scene.count > LARGE_SCENE:
-            _write_in_parts(job, rule, path, workers.threads, files)
-            return Converted(job.scene.count, None, viewer)
+            large, train = job.scene, job.cameras.train
+            if blurring(large.fused) or large.raw(0, min(1, large.count)).filter_3d is not None:
+                train = ()  # it needs no cameras, or is refused anyway
+            else:
+                job.say_assumed()
+                if not job.cameras.assumed:
+                    check_frame_of(large, train, options.min_seen)
+            with job.monitor.progress("converting", "Gaussians") as tell:
+                parts = convert_parts(large, train, rule, tell, threads=workers.threads)
+                write_parts(path, parts, large.count, **files)
+            return Converted(large.count, None, viewer)
         else:
-            fused = _closed_form(job, rule)
+            gaussians, training = job.scene.gaussians(), None
+            if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
+                training = TrainingViews.of(gaussians, job.cameras, min_seen=options.min_seen)
+                look = own_look(gaussians, training, background=background_colour(options.background, job.cameras))
+                job.check_fit(look)
+                job.say_assumed(look)
+            fused = fuse(gaussians, training, rule)
         if path is not None:
             write_scene(path, fused, **files)
     return Converted(len(fused), fused, viewer, report)
-
-
-def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
-    gaussians = job.scene.gaussians()
-    training = None
-    if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
-        training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
-        look = own_look(gaussians, training, background=background_colour(job.options.background, job.cameras))
-        job.check_fit(look)
-        job.say_assumed(look)
-    return fuse(gaussians, training, form)
 
 
 def _write_frames(
@@ -143,19 +147,6 @@ def _write_frames(
             count += len(gaussians)
             tell(done, len(frames))
     return count
-
-
-def _write_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> None:
-    """Write the closed form of a large file part by part."""
-    scene, train = job.scene, job.cameras.train
-    if blurring(scene.fused) or scene.raw(0, min(1, scene.count)).filter_3d is not None:
-        train = ()  # it needs no cameras, or is refused anyway
-    else:
-        job.say_assumed()
-        if not job.cameras.assumed:
-            check_frame_of(scene, train, job.options.min_seen)
-    with job.monitor.progress("converting", "Gaussians") as tell:
-        write_parts(path, convert_parts(scene, train, form, tell, threads=threads), scene.count, **files)
 
 
 def convert_parts(

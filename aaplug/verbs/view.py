@@ -13,7 +13,6 @@ from aaplug.options.shared import RECIPE_NAMES
 from aaplug.options.verbs import LiveOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.extras import check_installed
-from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
 SAMPLE = "chair.ply"
@@ -65,16 +64,15 @@ def view(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions) ->
     Raises:
         AaplugError: an input cannot be read, an option does not fit, or nothing can listen at the address.
     """
+    say = options.monitor.say
     with serving(scene, cameras, **vars(options)) as address:
-        attend(address, options.monitor, options.no_browser)
-
-
-def attend(address: str, monitor: Monitor, no_browser: bool) -> None:
-    """Open the page and wait for an interruption.  A browser that runs in the terminal would take it over."""
-    monitor.say(f"open {address} in a browser; Ctrl-C ends")
-    if not no_browser:
-        with suppress(webbrowser.Error):
-            browser = webbrowser.get()
-            if type(browser) is not webbrowser.GenericBrowser:
-                browser.open(address)
-    threading.Event().wait()
+        say(f"open {address} in a browser; Ctrl-C ends")
+        if not options.no_browser:
+            with suppress(webbrowser.Error):
+                browser = webbrowser.get()
+                if type(browser) is not webbrowser.GenericBrowser:  # that runs in the terminal, and would take it over
+                    browser.open(address)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:  # the usual end
+            say("closed")
