@@ -21,7 +21,7 @@ from aaplug.io.atomic import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import PlugInError, UsageError
-from aaplug.system.plug_ins import asked, check_answer
+from aaplug.system.plug_ins import asked
 
 Image = Float[Tensor, "h w 3"]
 LpipsFiles = tuple[AnyPath, AnyPath]  # of the trunk and of the heads
@@ -137,14 +137,6 @@ class Metric:
         check_fields(self)
         if (self.measure is None) == (self.figure is None):
             raise UsageError(f"metric {self.name}", "needs either `measure` or `figure`")
-
-    def prepared(self, protocol: Protocol, lpips_weights: LpipsFiles | None) -> "Metric":
-        """The metric as a protocol asks for it; see `prepare`."""
-        if self.prepare is None:
-            return self
-        metric = asked("metric", self, "prepare", protocol, lpips_weights)
-        check_answer(f"`prepare` of metric {self.name}", metric, Metric)
-        return metric
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""

@@ -26,6 +26,7 @@ from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
 from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
 from aaplug.system.extras import check_installed
+from aaplug.system.plug_ins import asked, check_answer
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -188,7 +189,11 @@ def find_metrics(
     if len(set(metrics)) != len(metrics):
         raise UsageError("metric", "a metric is named twice")
     protocol = replace(protocol, **{name: flavour for name, _, flavour in parts if flavour})
-    return [metric.prepared(protocol, lpips_weights) for metric in metrics]
+    for place, metric in enumerate(metrics):
+        if metric.prepare is not None:
+            metrics[place] = asked("metric", metric, "prepare", protocol, lpips_weights)
+            check_answer(f"`prepare` of metric {metric.name}", metrics[place], Metric)
+    return metrics
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:

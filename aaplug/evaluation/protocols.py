@@ -19,6 +19,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
 from aaplug.core.imaging import resampled, stretched
 from aaplug.core.rules import NEAR
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError
 
 SsimFlavour = Literal["wang", "3dgs"]
@@ -44,13 +45,16 @@ class Protocol:
     name: str
     source: str
     scales: tuple[float, ...]
-    truth: TruthSource | None = None
+    truth: Literal["photographs", "self"] | None = None
     change: Change = "size"
     downscale: str = "box"
     whole_sizes: bool = False
     ssim: SsimFlavour = "wang"
     lpips: LpipsFlavour = "vgg"
     background: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def camera(self, view: Camera, scale: float, depth: float) -> Camera:
         """The view as it is rendered at a scale; depth: median depth of the scene in it, in world units."""

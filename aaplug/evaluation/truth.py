@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -26,7 +27,7 @@ from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError, not_one_of
+from aaplug.system.errors import UsageError
 
 NO_PHOTOGRAPH = "has no photograph; `truth` self compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
@@ -37,16 +38,14 @@ Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
 
 
-def source_of(views: Sequence[Camera], name: str = "auto") -> TruthSource:
+def source_of(views: Sequence[Camera], name: Literal["auto", "photographs", "self"] = "auto") -> TruthSource:
     """The source of this name; for "auto", photographs if every view has one, else the scene's own render ("self").
 
-    Raises UsageError if there is no source of that name, or a view has no photograph.
+    Raises UsageError if the source is photographs and a view has none.
     """
     missing = [view.name for view in views if view.photo is None]
     if name == "self" or (name == "auto" and missing):
         return "self"
-    if name not in ("auto", "photographs"):
-        raise UsageError("truth", not_one_of(name, ("auto", "photographs", "self")))
     if missing:
         raise UsageError(missing[0], NO_PHOTOGRAPH)
     return "photographs"

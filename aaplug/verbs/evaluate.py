@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.engine import Task, candidates_of, facts_of
@@ -17,7 +16,6 @@ from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike
-from aaplug.io.scenes.scene import Scene
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
@@ -70,7 +68,17 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         job.announce(task.renderers, task.sized_views, cost=task.cost)
         job.say_assumed(look)
         choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
-        facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": choices}
+        whole = job.scene.gaussians() if job.scene.levels is None else job.scene.levels.scene
+        file = whole.origin and Path(whole.origin.path)
+        about = {
+            "file": file and file.name,
+            "sha256": digest_of_files([file]) if file and file.is_file() else None,
+            "gaussians": len(whole),
+            "gaussians_sha256": job.scene.digest,
+            "convention": whole.convention.name,
+            "evidence": whole.origin and whole.origin.evidence,
+        }
+        facts = {**facts_of(task, job.cameras.notes), "scene": about, "options": choices}
         apply = workers.cluster.map if workers.cluster else map
         if folder and options.overwrite:
             remove_run(folder)
@@ -81,8 +89,8 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             files = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), replaces)
             if options.report:
                 files += write_page(folder, name, report, task.coverage(job.scene.gaussians()), images, replaces)
-            for file in files:
-                job.monitor.say(f"wrote {file}")
+            for written in files:
+                job.monitor.say(f"wrote {written}")
     return report
 
 
@@ -110,17 +118,3 @@ def check_journalled(
     if (folder / JOURNAL).exists() and not (overwrite or resume):
         raise OutputError(folder, f"holds {what}; `resume` continues it, `overwrite` starts anew")
     refuse_existing([folder / name for name in (JOURNAL, *files)], overwrite or resume)
-
-
-def facts_of_scene(scene: Scene) -> dict[str, Any]:
-    """File, number and convention of a scene's Gaussians, and hashes of them and of the file."""
-    gaussians = scene.gaussians() if scene.levels is None else scene.levels.scene
-    origin = gaussians.origin
-    return {
-        "file": origin and Path(origin.path).name,
-        "sha256": digest_of_files([origin.path]) if origin and Path(origin.path).is_file() else None,
-        "gaussians": len(gaussians),
-        "gaussians_sha256": scene.digest,
-        "convention": gaussians.convention.name,
-        "evidence": origin and origin.evidence,
-    }
