@@ -88,7 +88,7 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli, monkeypatch):
     measured = list[str]()
 
     def noted(task, **how):
-        measured.extend(candidate.name for candidate in task.candidates)
+        measured.extend(task.renderers)
         return evaluate(task, **how)
 
     monkeypatch.setattr("aaplug.finetuning.fitting.evaluate", noted)

@@ -322,8 +322,8 @@ def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         aaplug.compare(["scene.ply", "scene.ply"], ".", rasterizer="eager")
     (task,) = seen
-    assert all(candidate.renderer.scene.origin is None for candidate in task.candidates)
-    assert task.truth.renderer.scene is task.candidates[0].renderer.scene
+    assert all(renderer.scene.origin is None for renderer in task.renderers.values())
+    assert task.truth.renderer.scene is next(iter(task.renderers.values())).scene
 
 
 def test_bytes_of_a_folder_of_images_are_those_of_all():

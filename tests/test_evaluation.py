@@ -13,7 +13,7 @@ from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation import METRICS, PROTOCOLS
-from aaplug.evaluation.engine import Candidate, Task, candidates_of, evaluate
+from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
@@ -68,9 +68,9 @@ def drawn(look, view, recipe="classic"):
 
 def task(look, views, source="photographs", protocol="default", recipes=("classic", "matched"), **changes):
     recipes = [find_recipe(recipe) if isinstance(recipe, str) else recipe for recipe in recipes]
-    candidates = candidates_of(look.scene, look.training, recipes, look.rasterizer)
+    renderers = renderers_of(look.scene, look.training, recipes, look.rasterizer)
     truth = Truth(look, source, PROTOCOLS[protocol])
-    return Task(**({"candidates": candidates, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth} | changes))
+    return Task(**({"renderers": renderers, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth} | changes))
 
 
 def test_figures_are_those_of_the_images_compared_by_hand(look, views):
@@ -99,12 +99,13 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(look, vie
 
 
 def test_work_without_a_truth_empty_or_doubled_is_refused(look, views):
-    bare, nothing = [replace(views[0], photo=None)], Candidate("none", replace(look, scene=look.scene[:0]))
+    bare, nothing = [replace(views[0], photo=None)], {"none": replace(look, scene=look.scene[:0])}
     for given, changes, words in (
-        (views, {"candidates": [nothing]}, "has no Gaussians to measure"),
+        (views, {"renderers": nothing}, "has no Gaussians to measure"),
         (views, {"scales": ()}, "needs at least"),
         (views, {"scales": (0.0,)}, "above 0"),
         (views, {"scales": (1.0, 1.0)}, "named twice"),
+        (views, {"recipes": ("auto", "auto")}, "a recipe is named twice"),
         (bare, {}, "a: has no photograph"),
         (views, {"protocol": "fov"}, "moves the camera"),
     ):
@@ -294,10 +295,9 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, vie
     assert (len(tables(report)), tables(report)[1:3]) == (5, lines)
 
 
-def test_candidates_compare_as_by_hand(look, views):
+def test_renderers_compare_as_by_hand(look, views):
     other = replace(look, background=(1.0, 1.0, 1.0))  # so it is drawn anew
-    candidates = [Candidate("own", look), Candidate("other", other)]
-    report = evaluate(Task(candidates, (1.0, 0.5), views, Truth(look, memory=1e9), ceiling=False))
+    report = evaluate(Task({"own": look, "other": other}, (1.0, 0.5), views, Truth(look, memory=1e9), ceiling=False))
     assert report.recipes == ("own", "other")
     assert report.select("own", 1.0)[0].values["PSNR"] > 60  # but for the float16 of the cached truth
     wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(CACHE_DTYPE).float())

@@ -8,7 +8,7 @@ import torch
 from aaplug.core.cameras import CameraSet
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.engine import Task, candidates_of, evaluate
+from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.results import mean
 from aaplug.evaluation.truth import Truth
 from aaplug.methods.presets import find_recipe
@@ -74,8 +74,8 @@ def test_evaluation_tells_apart_recipes_that_draw_different_levels():
     truth = Truth(own_look(levels.finest, training, "eager"))
 
     def figures(*recipes: Recipe) -> list[float | None]:
-        candidates = candidates_of(levels, training, recipes, "eager")
-        report = evaluate(Task(candidates, (1 / 8,), VIEWS[:1], truth))
+        renderers = renderers_of(levels, training, recipes, "eager")
+        report = evaluate(Task(renderers, (1 / 8,), VIEWS[:1], truth))
         return [mean(report.select(recipe.name, 1 / 8), "PSNR") for recipe in recipes]
 
     assert figures(fine, coarse) == [*figures(fine), *figures(coarse)]

@@ -9,7 +9,7 @@ from aaplug.core.colours import WHITE
 from aaplug.core.ellipses import cull
 from aaplug.core.projection import project
 from aaplug.core.shading import shade
-from aaplug.evaluation.engine import Task, candidates_of, evaluate
+from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import CEILING, mean
 from aaplug.evaluation.truth import Truth
@@ -47,8 +47,8 @@ def test_recipes_rank_as_measured_on_the_sample(sample_scene, sample_cameras, sa
     """The order that the project stands for, at 1/8 on one photograph; figures are in the README."""
     recipes = [RECIPES[name] for name in ("classic", "mip", "matched", "auto")]
     look = own_look(sample_scene, sample_training, "eager", WHITE)
-    candidates = candidates_of(sample_scene, sample_training, recipes, "eager", WHITE)
-    task = Task(candidates, (0.125,), sample_cameras.test[1:2], Truth(look, "photographs"), [PSNR])
+    renderers = renderers_of(sample_scene, sample_training, recipes, "eager", WHITE)
+    task = Task(renderers, (0.125,), sample_cameras.test[1:2], Truth(look, "photographs"), [PSNR])
     report = evaluate(task)
     dB = {name: mean(report.select(name, 0.125), "PSNR") for name in report.recipes}
     assert dB["classic"] + 7 < dB["mip"] < dB["matched"] < dB["auto"] - 6, dB

@@ -26,7 +26,7 @@ from rich.table import Table
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians, digest_of_scene
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.evaluation.alignment import PAIR_DISTANCE, mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Report, mean, spread_of, tables
@@ -125,15 +125,12 @@ class ComparedScene:
     gaussians: int
     sh_degree: int
     convention: str
-    digest: str
     frame: str | None = None
     differences: Differences | None = None
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready."""
-        facts = vars(self) | {"differences": self.differences and self.differences.as_json()}
-        del facts["digest"]  # the protocol has it
-        return facts
+        return vars(self) | {"differences": self.differences and self.differences.as_json()}
 
 
 def in_one_frame(scenes: Mapping[str, Scene], say: Say = lambda text: None) -> dict[str, Scene]:
@@ -183,7 +180,6 @@ def compared_scenes(
                 gaussians=len(gaussians),
                 sh_degree=gaussians.sh_degree,
                 convention=gaussians.convention.name,
-                digest=digest_of_scene(gaussians),
                 frame=frame,
                 differences=differences(first, gaussians) if rows else None,
             )

@@ -1,6 +1,6 @@
-"""Multi-scale evaluation: candidates, each a name and a renderer, at every scale against one truth.
+"""Multi-scale evaluation: renderers, each with a name, at every scale against one truth.
 
-For every view and scale: make the truth, draw each candidate, compare, note a `Measurement`.  A protocol says what a
+For every view and scale: make the truth, draw by each renderer, compare, note a `Measurement`.  A protocol says what a
 scale changes and where the truth comes from (`evaluation.protocols`).  Renders are clamped and rounded to 8 bits
 before they are compared.  Views stream: only the numbers of finished views are kept.
 """
@@ -44,42 +44,36 @@ EQUAL_IMAGES_SIDE = 64  # px: of images that equal their truth, metrics look at 
 Values = Mapping[str, float | None]
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A scene as one recipe shows it, under a name of its own."""
-
-    name: str
-    renderer: Renderer
-
-
-def candidates_of(
+def renderers_of(
     scene: SceneLike,
     training: TrainingViews,
     recipes: Sequence[Recipe],
     rasterizer: str | Rasterizer = "auto",
     background: Background = "auto",
-) -> list[Candidate]:
+) -> dict[str, Renderer]:
     """One scene by several recipes that suit it; those with the same world filter share the filtered scene."""
-    renderers: dict[tuple[WorldFilter | None, bool], Renderer] = {}
-    candidates = []
+    shared, renderers = dict[tuple[WorldFilter | None, bool], Renderer](), dict[str, Renderer]()
     for recipe in recipes:
         key = recipe.world, recipe.levels is not None
-        if key not in renderers:
-            renderers[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
-        candidates.append(Candidate(recipe.name, replace(renderers[key], recipe=recipe)))
-    return candidates
+        if key not in shared:
+            shared[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
+        renderers[recipe.name] = replace(shared[key], recipe=recipe)
+    if len(renderers) < len(recipes):
+        raise UsageError("evaluate", "a recipe is named twice")
+    return renderers
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Candidates, scales and views to evaluate, and the truth to evaluate them against.
+    """Renderers, scales and views to evaluate, and the truth to evaluate them against.
 
+    renderers: by the names of their rows.
     views: at the training size.
     metrics: None takes PSNR and the protocol's SSIM.
     ceiling: add a row for the scene's own training-size look, resampled (where the protocol changes the size).
     """
 
-    candidates: Sequence[Candidate]
+    renderers: Mapping[str, Renderer]
     scales: Sequence[float]
     views: Sequence[Camera]
     truth: Truth
@@ -88,15 +82,14 @@ class Task:
 
     def __post_init__(self) -> None:
         """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs."""
-        if not (self.candidates and self.scales and self.views):
+        if not (self.renderers and self.scales and self.views):
             raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
-        for each in self.renderers:
+        for each in self.renderers.values():
             if not len(each.scene) and each.in_time is None:
                 raise UsageError(each.scene.name, "has no Gaussians to measure")
         if any(not (scale > 0 and math.isfinite(scale)) for scale in self.scales):
             raise UsageError("scale", f"sizes must be above 0, got {min(self.scales):g}")
-        names = {CEILING, *(candidate.name for candidate in self.candidates)}
-        if len(names) != len(self.candidates) + 1 or len(set(self.scales)) != len(self.scales):
+        if CEILING in self.renderers or len(set(self.scales)) != len(self.scales):
             raise UsageError("evaluate", "a recipe or a scale is named twice")
         if self.truth.source == "photographs":
             if not self.resizes:
@@ -115,7 +108,7 @@ class Task:
     def rows(self) -> list[str]:
         """Rows of the report; every view has a measurement of each at every scale."""
         ceiling = [CEILING] if self.ceiling and self.resizes and self.truth.source != "reference" else []
-        return ceiling + [candidate.name for candidate in self.candidates]
+        return [*ceiling, *self.renderers]
 
     @cached_property
     def sized_views(self) -> list[Camera]:
@@ -125,8 +118,8 @@ class Task:
 
     @property
     def cost(self) -> Cost:
-        """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
-        images, sized, count = cost_of(self.renderers, self.sized_views), self.sized_views, len(self.scales)
+        """An estimate: every renderer's images, the truths, which are as fine as training, and their comparison."""
+        images, sized, count = cost_of([*self.renderers.values()], self.sized_views), self.sized_views, len(self.scales)
         if self.resizes:
             truths = [cost_of([self.truth.renderer], self.views)]
         else:
@@ -136,15 +129,10 @@ class Task:
         seconds = images.seconds + sum(cost.seconds for cost in truths) + COMPARED * compared
         return images._replace(seconds=seconds, image=max(images.image, *(cost.image for cost in truths)))
 
-    @property
-    def renderers(self) -> list[Renderer]:
-        """Renderers of the candidates."""
-        return [candidate.renderer for candidate in self.candidates]
-
     def coverage(self, scene: Gaussians) -> Coverage:
-        """The scene's extents against their sampling bounds, and the candidates' energy above the Nyquist rate."""
-        drawn = product(self.candidates, self.scales if self.resizes else ())
-        above = {(c.name, scale): above_nyquist(c.renderer, self.views, scale) for c, scale in drawn}
+        """The scene's extents against their sampling bounds, and the renderers' energy above the Nyquist rate."""
+        drawn = product(self.renderers.items(), self.scales if self.resizes else ())
+        above = {(name, scale): above_nyquist(renderer, self.views, scale) for (name, renderer), scale in drawn}
         return replace(coverage(scene, self.truth.renderer.training, self.scales), above_nyquist=above)
 
     @property
@@ -162,7 +150,7 @@ def evaluate(
     images: ImageStore | None = None,
     apply: Apply = map,
 ) -> Report:
-    """Measure every candidate at every scale on every view.
+    """Measure every renderer at every scale on every view.
 
     facts: JSON-ready entries to add to the report's protocol (versions, hashes).
     tell: called with (views done, views in all).
@@ -211,9 +199,9 @@ def _request(task: Task) -> dict[str, Any]:
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
         "scales": list(task.scales),
-        "recipes": {c.name: c.renderer.recipe.source for c in task.candidates},
-        "recipes_sha256": {c.name: c.renderer.recipe.digest for c in task.candidates},
-        "rasterizer": task.candidates[0].renderer.rasterizer.name,
+        "recipes": {name: renderer.recipe.source for name, renderer in task.renderers.items()},
+        "recipes_sha256": {name: renderer.recipe.digest for name, renderer in task.renderers.items()},
+        "rasterizer": next(iter(task.renderers.values())).rasterizer.name,
     }
 
 
@@ -244,10 +232,10 @@ class ViewMeasurer:
     images: ImageStore | None
 
     def __call__(self, index: int) -> tuple[int, tuple[Measurement, ...]]:
-        """Measure every candidate at every scale."""
+        """Measure every renderer at every scale."""
         view, measured, measurements = self.task.views[index], self.task.measured, list[Measurement]()
         truth = ViewTruth(self.task.truth, view)
-        training_size: dict[str, TimedImage] = {}  # by candidate
+        training_size: dict[str, TimedImage] = {}  # by row
         for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
             expected, compared = truth.compared(scale), dict[TimedImage, Values]()
             for name, image in self._images(truth, scale):
@@ -266,7 +254,7 @@ class ViewMeasurer:
         return index, tuple(measurements)
 
     def _images(self, truth: ViewTruth, scale: float) -> Iterator[tuple[str, TimedImage]]:
-        """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
+        """The rows' images at a scale; renderers that draw alike, as several do at the training size, draw once."""
         camera = truth.camera(scale)
         images: dict[Hashable, TimedImage] = {}
         if truth.truth.source == "reference":
@@ -292,7 +280,7 @@ class ViewMeasurer:
 
     @cached_property
     def _renderers(self) -> dict[str, TimedRenderer]:
-        return {c.name: TimedRenderer(c.renderer) for c in self.task.candidates}
+        return {name: TimedRenderer(renderer) for name, renderer in self.task.renderers.items()}
 
     def _series(self, truth: ViewTruth, name: str, scale: float, image: TimedImage, full: TimedImage | None) -> Series:
         def frames() -> tuple[list[Image], list[Image]]:
@@ -312,11 +300,11 @@ class ViewMeasurer:
             scene = scenes.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))
             return replace(renderer, scene=scene, source=None)
 
-        candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
+        renderers = {name: portable(renderer) for name, renderer in self.task.renderers.items()}
         truth = replace(self.task.truth, renderer=portable(self.task.truth.renderer))
         views = [view if view.photo is None else replace(view, photo=view.photo.absolute()) for view in self.task.views]
         images = self.images and replace(self.images, folder=self.images.folder.absolute())
-        return {"task": replace(self.task, candidates=candidates, truth=truth, views=views), "images": images}
+        return {"task": replace(self.task, renderers=renderers, truth=truth, views=views), "images": images}
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:

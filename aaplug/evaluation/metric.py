@@ -1,4 +1,4 @@
-"""Metric: a named number about an image; and the timed images of one candidate that it can look at.
+"""Metric: a named number about an image; and the timed images of one renderer that it can look at.
 
 Images are [h, w, 3] in [0, 1].
 """
@@ -91,12 +91,12 @@ class TimedRenderer:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Images of one candidate in one view at one scale.
+    """Images of one renderer in one view at one scale.
 
     image: at that scale.
-    full: by the same candidate at the training size; None if scale 1 is not measured or a scale moves the camera.
+    full: by the same renderer at the training size; None if scale 1 is not measured or a scale moves the camera.
     smaller: averages a training-size image down to that scale.
-    frames: draws the candidate's frames of a small motion, and those of the truth: of the scene's own look, averaged
+    frames: draws the renderer's frames of a small motion, and those of the truth: of the scene's own look, averaged
         down, or of the reference; None if a scale moves the camera.
     """
 
@@ -116,7 +116,7 @@ class Metric:
     digits: decimals in tables.
     protocol: the field's variant that it is, in words.
     measure: the value for an image of 8 bits and the truth; None where it is undefined.
-    figure: the value for images of one candidate, without a truth; None where it is undefined.
+    figure: the value for images of one renderer, without a truth; None where it is undefined.
     undefined: the reason why a value can be None; reports print it as a note.
     smaller: `figure` is defined below the training size alone.
     prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.

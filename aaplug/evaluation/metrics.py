@@ -1,4 +1,4 @@
-"""Metrics: those that compare an image with a truth, and figures of one candidate, which need no truth.
+"""Metrics: those that compare an image with a truth, and figures of one renderer, which need no truth.
 
 Images are [h, w, 3] in [0, 1].  A value that is not defined (images too small) or infinite (equal images) is None.
 A package adds a metric by an entry point in the group "aaplug.metrics": a `Metric` with a `measure` of image and truth.

@@ -29,9 +29,9 @@ Facts = tuple[str, list[str], list[list[str]]]  # a table of text: title, headin
 
 @dataclass(frozen=True)
 class Measurement:
-    """One candidate at one scale on one view.
+    """One renderer at one scale on one view.
 
-    recipe: the candidate's name.
+    recipe: the renderer's name.
     values: by metric; None where undefined, for the reason in `note`.
     samples: along a pixel's side.
     evaluations: splat-pixel evaluations of compositing; None where not counted.

@@ -3,12 +3,12 @@
 Where tuning made one worse, parts of the change are tried, and then the closed form, if it is not worse itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
-from aaplug.evaluation.engine import Candidate, Task, evaluate
+from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
@@ -44,16 +44,16 @@ def fit(
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
     original = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
 
-    def measure(*candidates: Candidate) -> Report:
+    def measure(renderers: Mapping[str, Renderer]) -> Report:
         with monitor.progress("measuring", "views") as tell:
-            task = Task(candidates, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
+            task = Task(renderers, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
             return evaluate(task, tell=tell)
 
     def report_of(result: Gaussians) -> Report:
-        return before.with_more(measure(Candidate(CONVERTED, replace(original, scene=result))))
+        return before.with_more(measure({CONVERTED: replace(original, scene=result)}))
 
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
-    before = measure(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
+    before = measure({ORIGINAL: original, CLOSED_FORM: start})
     if steps and _is_worse(before, CLOSED_FORM):
         problem = "the closed form, which `--steps 0` keeps, is worse than the original at some scale"
         monitor.say(f"{problem}: starting from the original")

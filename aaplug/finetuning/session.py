@@ -13,7 +13,7 @@ from typing import Any
 from aaplug.core.cameras import spread
 from aaplug.core.conventions import Convention
 from aaplug.core.gaussians import Fusion, Gaussians
-from aaplug.evaluation.engine import Candidate, Task, evaluate
+from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import mean, scale_name
 from aaplug.finetuning.loop import run
@@ -45,8 +45,8 @@ def tune(
     def keep(state: State) -> None:
         """Measure a few training views at the training size and the farthest scale; write the checkpoint; say both."""
         scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
-        now = Candidate("now", replace(state, group=None).renderer(job))
-        report = evaluate(Task([now], scales, spread(job.views, PROBE_VIEWS), job.truth, ceiling=False))
+        now = {"now": replace(state, group=None).renderer(job)}
+        report = evaluate(Task(now, scales, spread(job.views, PROBE_VIEWS), job.truth, ceiling=False))
         psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
         state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
         losses = [loss for step in state.curve[-LOSS_STEPS:] for loss in step["loss"].values()]

@@ -8,9 +8,10 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.gaussians import digest_of_scene
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
-from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
+from aaplug.evaluation.engine import Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.metrics import PSNR, find_metrics
@@ -71,15 +72,14 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         if viewer is not None:
             recipe, pairs = recipe_of(viewer), zip(named.values(), renderers, strict=True)
             renderers = [Renderer.of(viewer.shown(s.gaussians()), r.training, recipe, **same) for s, r in pairs]
-        candidates = [Candidate(name, renderer) for name, renderer in zip(named, renderers, strict=True)]
-        task = Task(candidates, scales, views, truth, metrics, ceiling=False)
-        job.announce(renderers, task.sized_views, cost=task.cost, processes=workers.threads)
+        task = Task(dict(zip(named, renderers, strict=True)), scales, views, truth, metrics, ceiling=False)
+        job.announce([*task.renderers.values()], task.sized_views, cost=task.cost, processes=workers.threads)
         job.say_assumed(look)
         facts = facts_of(task, job.cameras.notes) | {
             "rows": "compared scene",
             "reference": rows[0].name,
             "viewer": viewer and viewer.name,
-            "scenes_sha256": {row.name: row.digest for row in rows},
+            "scenes_sha256": {name: digest_of_scene(scene.gaussians()) for name, scene in named.items()},
             "options": options.choices | {"shown": options.show},
         }
         if folder and options.overwrite:
@@ -135,5 +135,5 @@ def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
     values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
     defined = [(value, view) for value, view in values if value is not None]
     worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
-    others = [candidate for candidate in task.candidates if candidate.name != reference]
+    others = {name: renderer for name, renderer in task.renderers.items() if name != reference}
     return sheet_of(task.truth, task.views[worst], sorted(task.scales, reverse=True), others, reference, errors=True)

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from aaplug.evaluation import PROTOCOLS
-from aaplug.evaluation.engine import Task, candidates_of, facts_of
+from aaplug.evaluation.engine import Task, facts_of, renderers_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import JOURNAL
@@ -62,10 +62,10 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views)[0])
             views = job.views
         look = job.look(frames, check=False)
-        candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
-        task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
+        renderers = renderers_of(job.scene, look.training, recipes, look.rasterizer, look.background)
+        task = Task(renderers, scales, views, Truth(look, source, protocol), metrics)
         job.check_fit(look)
-        job.announce(task.renderers, task.sized_views, cost=task.cost)
+        job.announce([*task.renderers.values()], task.sized_views, cost=task.cost)
         job.say_assumed(look)
         choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
         whole = job.scene.gaussians() if job.scene.levels is None else job.scene.levels.scene

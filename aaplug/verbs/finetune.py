@@ -15,7 +15,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
-from aaplug.evaluation.engine import Candidate, Task, evaluate
+from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.report.contact_sheet import sheet_of
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
@@ -133,19 +133,19 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             write_scene(path, result, overwrite=replaces, **files)
             reading = {"convention": result.convention, "spz_axes": files["spz_axes"]}
             written = read_scene(path, **reading).gaussians()  # many formats hold less
-        closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))
+        closed = {"closed form": start} if len(start.scene.fused) > len(raw.fused) else {}
         bounds = sampling_bounds(written.means, train)  # densification may have changed the number of Gaussians
         after = replace(start, scene=written, training=replace(start.training, bounds=bounds))
-        candidates = [Candidate("before", before), *closed, Candidate("after", after)]
+        renderers = {"before": before, **closed, "after": after}
         scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(truth, source=source_of(job.views))
         with job.monitor.progress("measuring", "views") as tell:
-            report = evaluate(Task(candidates, scales, job.views, truth, ceiling=False), tell=tell)
+            report = evaluate(Task(renderers, scales, job.views, truth, ceiling=False), tell=tell)
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
             told = json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1)
             write_file(_beside(path, "json"), told.encode(), replaces)
-            sheet = sheet_of(truth, job.views[0], scales, candidates, "truth")
+            sheet = sheet_of(truth, job.views[0], scales, renderers, "truth")
             write_png(_beside(path, "png"), sheet, overwrite=replaces)
             _beside(path, "pt").unlink(missing_ok=True)
     return tuned

@@ -4,7 +4,7 @@ Images are [h, w, 3] in [0, 1].  OpenCV's built-in font has ASCII alone: other s
 """
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate, count
 
 import cv2
@@ -15,10 +15,10 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.imaging import levels, quantised
-from aaplug.evaluation.engine import Candidate
 from aaplug.evaluation.metrics import PSNR, psnr
 from aaplug.evaluation.results import elided, scale_name
 from aaplug.evaluation.truth import Truth
+from aaplug.rendering.renderer import Renderer
 
 CELL_HEIGHT = 320  # px
 GAP = 12  # px
@@ -74,14 +74,14 @@ def sheet_of(
     truth: Truth,
     view: Camera,
     scales: Sequence[float],
-    candidates: Sequence[Candidate],
+    renderers: Mapping[str, Renderer],
     heading: str,
     errors: bool = False,
 ) -> Float[Tensor, "H W 3"]:
-    """A view at every scale: the truth under this heading, then each candidate under its name; see `contact_sheet`."""
+    """A view at every scale: the truth under this heading, then each renderer's image by name; see `contact_sheet`."""
     with torch.no_grad():
-        rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
-    return contact_sheet((heading, *(candidate.name for candidate in candidates)), rows, errors)
+        rows = [(s, [truth(view, s), *(draw(view.scaled(s)).rgb for draw in renderers.values())]) for s in scales]
+    return contact_sheet((heading, *renderers), rows, errors)
 
 
 def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
