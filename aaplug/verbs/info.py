@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.orbits import Frame
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import above_nyquist, aliasing_begins
 from aaplug.evaluation.results import scale_name
@@ -59,38 +58,44 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         check_frame_of(opened, train, options.min_seen)
     with job.monitor.progress("reading", "Gaussians") as tell:
         statistics = survey(opened, train, tell)
-    if isinstance(orbit, Orbit) and job.cameras.assumed:
-        frame = frame_around(opened, orbit)
-        sampling = _assumed_facts(statistics, job.cameras, frame, up_evidence(opened, orbit, frame))
-    else:
-        sampling = _sampling_facts(opened, statistics, job.cameras) if train else {}
     comments = opened.document.header.comments if isinstance(opened.document, Document) else []
-    problems = list(_problems(opened, statistics, comments))
-    return _scene_facts(opened, statistics, comments) | sampling | {"problems": problems}
-
-
-def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> dict[str, Any]:
-    return {
-        "file": scene.name,
-        "format": scene.format,
-        "bytes": scene.bytes,
-        "gaussians": scene.count,
-        "unusable_gaussians": scene.count - statistics.count,
-        "sh_degree": scene.sh_degree,
-        "convention": scene.convention.name,
-        "evidence": scene.evidence,
-        "kernel_px2": scene.convention.kernel,
-        "compensated": scene.convention.compensated,
-        "two_dimensional": scene.flat,
+    facts = {
+        "file": opened.name,
+        "format": opened.format,
+        "bytes": opened.bytes,
+        "gaussians": opened.count,
+        "unusable_gaussians": opened.count - statistics.count,
+        "sh_degree": opened.sh_degree,
+        "convention": opened.convention.name,
+        "evidence": opened.evidence,
+        "kernel_px2": opened.convention.kernel,
+        "compensated": opened.convention.compensated,
+        "two_dimensional": opened.flat,
         "stored_filter_3d": statistics.filtered,
-        "fused": [{"method": f.method, **f.settings} for f in scene.fused],
-        "fused_text": described_fusions(scene.fused),
-        "notes": list(scene.notes),
+        "fused": [{"method": f.method, **f.settings} for f in opened.fused],
+        "fused_text": described_fusions(opened.fused),
+        "notes": list(opened.notes),
         "comments": comments,
         "low_corner": statistics.low.tolist() if statistics.count else None,
         "high_corner": statistics.high.tolist() if statistics.count else None,
         "needle_share": statistics.needles / max(1, statistics.count),
     }
+    if isinstance(orbit, Orbit) and job.cameras.assumed:
+        frame, side = frame_around(opened, orbit), max(train[0].hw)
+        shares = {size: statistics.multiples.share_below(math.log(side / size)) for size in PICTURE_SIDES}
+        facts |= {
+            "training_rate": job.cameras.notes[0].removeprefix(TRAINING_RATE),
+            "assumed_rate_px_per_unit": rate_of(job.cameras, frame),
+            "centre": frame.centre.tolist(),
+            "radius": frame.radius,
+            "up": frame.up.tolist(),
+            "up_evidence": up_evidence(opened, orbit, frame),
+            "surroundings_and_floaters_share": frame.outside,
+            "below_a_pixel_share": {str(size): share for size, share in shares.items() if share is not None},
+        }
+    elif train:
+        facts |= _sampling_facts(opened, statistics, job.cameras)
+    return facts | {"problems": list(_problems(opened, statistics, comments))}
 
 
 def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dict[str, Any]:
@@ -109,21 +114,6 @@ def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dic
         "aliasing_begins_at_scale": begins,
         "cameras": list(cameras.notes),
         "energy_above_nyquist_share": {n: found for n, found in above.items() if None not in found.values()},
-    }
-
-
-def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame, evidence: str) -> dict[str, Any]:
-    side = max(cameras.train[0].hw)
-    shares = {size: statistics.multiples.share_below(math.log(side / size)) for size in PICTURE_SIDES}
-    return {
-        "training_rate": cameras.notes[0].removeprefix(TRAINING_RATE),
-        "assumed_rate_px_per_unit": rate_of(cameras, frame),
-        "centre": frame.centre.tolist(),
-        "radius": frame.radius,
-        "up": frame.up.tolist(),
-        "up_evidence": evidence,
-        "surroundings_and_floaters_share": frame.outside,
-        "below_a_pixel_share": {str(size): share for size, share in shares.items() if share is not None},
     }
 
 
