@@ -128,8 +128,12 @@ def run(words: Sequence[str]) -> int:
                 console.show(answer.shown)
         return code
     if words and words[0] in ("-h", "--help"):
+        columns, longest = shutil.get_terminal_size().columns, max(map(len, VERBS))
         with _printing():
-            show_verbs()
+            print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n")
+            for name, command in VERBS.items():
+                first = command.help.partition("\n\n")[0]
+                print(fill(f"  {name:{longest}}  {first}", columns, subsequent_indent=" " * (longest + 4)))
         return 0
     if not words:
         problem = f"name a verb: {', '.join(VERBS)}"
@@ -138,14 +142,3 @@ def run(words: Sequence[str]) -> int:
     else:
         problem = f"there is no verb '{words[0]}'{did_you_mean(words[0], VERBS)}"
     raise UsageError("aaplug", f"{problem}; see `aaplug --help`")
-
-
-def show_verbs() -> None:
-    """Print what the program does, and each verb with the first line of its help."""
-    from .verbs import VERBS
-
-    print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n")
-    columns, longest = shutil.get_terminal_size().columns, max(map(len, VERBS))
-    for name, command in VERBS.items():
-        first = command.help.partition("\n\n")[0]
-        print(fill(f"  {name:{longest}}  {first}", columns, subsequent_indent=" " * (longest + 4)))

@@ -51,7 +51,12 @@ def filmed(
         if not path:
             problem = "is a share of the time between frames of a path; for one view give `camera_to`"
             raise UsageError("shutter", problem)
-        motions = _motions([_instant(view) for view in views], shutter)
+        if len(views) < 2:
+            raise UsageError("shutter", "finds no motion: the path has one frame")
+        frames, half = [_instant(view) for view in views], shutter / 2
+        ends = toward(frames[0], frames[1], -1.0), toward(frames[-1], frames[-2], -1.0)  # the path goes straight on
+        around = zip(frames, [ends[0], *frames[:-1]], [*frames[1:], ends[1]], strict=True)
+        motions = [(_moved(*each, -half), _moved(*each, half)) for each in around]
     if motions and all(
         torch.allclose(first.cam_from_world, last.cam_from_world, 1e-9, 1e-12) and first.intrinsics == last.intrinsics
         for first, last in motions
@@ -88,16 +93,6 @@ def _aperture(view: Camera, options: FilmOptions) -> Aperture | None:
 
 def _instant(view: Camera) -> Camera:
     return replace(view, exposure=None)
-
-
-def _motions(frames: Sequence[Camera], shutter: float) -> list[tuple[Camera, Camera]]:
-    """Cameras where the shutter opens and closes around each frame; beyond its ends a path goes straight on."""
-    if len(frames) < 2:
-        raise UsageError("shutter", "finds no motion: the path has one frame")
-    ends = toward(frames[0], frames[1], -1.0), toward(frames[-1], frames[-2], -1.0)
-    around = zip(frames, [ends[0], *frames[:-1]], [*frames[1:], ends[1]], strict=True)
-    half = shutter / 2
-    return [(_moved(*each, -half), _moved(*each, half)) for each in around]
 
 
 def _moved(frame: Camera, before: Camera, after: Camera, share: float) -> Camera:

@@ -90,11 +90,6 @@ class Job(Generic[O_co]):
         named = tuple(replace(v, frame=k, name=f"{v.name}-{n}", photo=None) for k, n in moments for v in views)
         return named if frames else views
 
-    def along(self, path: Sequence[Camera]) -> Sequence[Camera]:
-        """The cameras of a path, during which a scene in time passes once."""
-        count = len(self.scene.frames or ())
-        return [replace(view, frame=i * count // len(path)) for i, view in enumerate(path)] if count else path
-
     def look(self: "Job[ViewOptions]", frames: int | None, *, gradients: bool = False, check: bool = True) -> Renderer:
         """The scene as training showed it, with the background and rasterizer that the options ask for.
 

@@ -192,14 +192,6 @@ class _Maker:
             torch.cat([owners[~goes], taken]),
         )
 
-    def tuned_tree(self, front: Front, rates: Sequence[float]) -> Front:
-        """The tree after tuning for the rates of its levels."""
-        options, look, viewer = self.job.options, self.look, self.viewer
-        if not options.tuning or look is None or viewer is None:
-            return front
-        how = (rates, look, self.views, options.tuning, viewer, self.job.monitor)
-        return front._replace(scene=refine_tree(front.scene, front.parents, *how))
-
     def _tuned(self, level: Level) -> Level:
         options, look = self.job.options, self.look
         if not options.tuning or look is None or self.scene.flat:
@@ -300,7 +292,11 @@ def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]
     rate = float(rates[rates > 0].median())
     tree = None
     if to == "rad":
-        tree = maker.tuned_tree(streamed.read_front(folder, len(levels) - 1), [level.rate for level in levels])
+        tree = streamed.read_front(folder, len(levels) - 1)
+        if options.tuning and maker.look is not None and maker.viewer is not None:
+            rates_of_levels = [level.rate for level in levels]
+            how = (rates_of_levels, maker.look, maker.views, options.tuning, maker.viewer, maker.job.monitor)
+            tree = tree._replace(scene=refine_tree(tree.scene, tree.parents, *how))
     settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree)
     if options.page is not None:
         streamed.write_page(folder, to, Path(options.page))

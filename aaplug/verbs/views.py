@@ -32,10 +32,13 @@ def drawn(job: Job[Drawn], path: CameraPath, moves: bool, ends: Sequence[Camera]
 
     moves: the cameras are frames of one motion.  ends: where the shutter closes, see `filmed`.
     """
-    options, count = job.options, 2 if job.options.lens == "vr180" else 1
-    views, ends = (_seen(job, each, path.unsized) for each in (path.cameras, ends))
+    cameras, count = path.cameras, 2 if job.options.lens == "vr180" else 1
+    if moves and job.scene.frames is not None:  # a scene in time passes once
+        moments = len(job.scene.frames)
+        cameras = [replace(view, frame=i * moments // len(cameras)) for i, view in enumerate(cameras)]
+    views, ends = (_seen(job, each, path.unsized) for each in (cameras, ends))
     eyes = [(views[eye::count], ends[eye::count]) for eye in range(count)]
-    return [filmed(job.along(v) if moves else v, options, moves, path.shutter, end) for v, end in eyes]
+    return [filmed(eye_views, job.options, moves, path.shutter, eye_ends) for eye_views, eye_ends in eyes]
 
 
 def _seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
