@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from aaplug.evaluation.metric import Image, LpipsFiles, Metric
-from aaplug.evaluation.protocols import LpipsFlavour, Protocol
+from aaplug.evaluation.metric import Image, Metric
+from aaplug.evaluation.protocols import LpipsFlavour
 from aaplug.system.errors import FormatError, UsageError
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
@@ -112,15 +112,9 @@ def _state(path: Path) -> dict[str, Tensor]:
     return {key: value for key, value in state.items() if isinstance(value, Tensor)}
 
 
-def _with_weights(protocol: Protocol, files: LpipsFiles | None) -> Metric:
-    if files is None:
-        raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
-    return lpips_metric(protocol.lpips, *files)
-
-
 def _without_weights(image: Image, truth: Image) -> None:
     raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
 
 
 TOO_SMALL = f"image smaller than the {MIN_SIDE} px that LPIPS needs"
-LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=TOO_SMALL, prepare=_with_weights)
+LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=TOO_SMALL)

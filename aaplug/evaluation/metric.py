@@ -16,15 +16,12 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.interfaces import CountsEvaluations
-from aaplug.evaluation.protocols import Protocol
-from aaplug.io.atomic import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import PlugInError, UsageError
 from aaplug.system.plug_ins import asked
 
 Image = Float[Tensor, "h w 3"]
-LpipsFiles = tuple[AnyPath, AnyPath]  # of the trunk and of the heads
 SHIFT_STEPS = 4  # frames of a motion; between two of them the image moves 1/4 px right and down
 
 
@@ -119,7 +116,6 @@ class Metric:
     figure: the value for images of one renderer, without a truth; None where it is undefined.
     undefined: the reason why a value can be None; reports print it as a note.
     smaller: `figure` is defined below the training size alone.
-    prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
     name: str
@@ -131,7 +127,6 @@ class Metric:
     figure: Callable[[Series], float | None] | None = None
     undefined: str = "undefined for this image"
     smaller: bool = False
-    prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -21,12 +21,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.evaluation import METRICS
-from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
+from aaplug.evaluation.lpips import LPIPS, lpips_metric
+from aaplug.evaluation.metric import Image, Metric, Series
 from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
+from aaplug.io.atomic import AnyPath
 from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
 from aaplug.system.extras import check_installed
-from aaplug.system.plug_ins import asked, check_answer
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -116,11 +117,7 @@ PSNR = Metric("PSNR", "dB", math.inf, 2, "peak 1, over all channels, mean of per
 def _ssim(flavour: SsimFlavour, border: str) -> Metric:
     variant = f"{flavour}: {SSIM_WINDOW}×{SSIM_WINDOW} Gaussian, sigma 1.5, {border}, channel mean"
     small, measure = "image smaller than the SSIM window", partial(ssim, flavour=flavour)
-    return Metric("SSIM", "", 1.0, 4, variant, measure, undefined=small, prepare=_ssim_of)
-
-
-def _ssim_of(protocol: Protocol, _: LpipsFiles | None) -> Metric:
-    return SSIM[protocol.ssim]
+    return Metric("SSIM", "", 1.0, 4, variant, measure, undefined=small)
 
 
 SSIM: dict[SsimFlavour, Metric] = {
@@ -165,7 +162,7 @@ FLICKER = Metric(
 
 
 def find_metrics(
-    names: str | Sequence[str] | None, protocol: Protocol, lpips_weights: LpipsFiles | None = None
+    names: str | Sequence[str] | None, protocol: Protocol, lpips_weights: tuple[AnyPath, AnyPath] | None = None
 ) -> list[Metric]:
     """Metrics by name, in the flavours of a protocol where the names state none.
 
@@ -189,11 +186,12 @@ def find_metrics(
     if len(set(metrics)) != len(metrics):
         raise UsageError("metric", "a metric is named twice")
     protocol = replace(protocol, **{name: flavour for name, _, flavour in parts if flavour})
-    for place, metric in enumerate(metrics):
-        if metric.prepare is not None:
-            metrics[place] = asked("metric", metric, "prepare", protocol, lpips_weights)
-            check_answer(f"`prepare` of metric {metric.name}", metrics[place], Metric)
-    return metrics
+    flavoured = {"SSIM": SSIM[protocol.ssim]}
+    if LPIPS in metrics:
+        if lpips_weights is None:
+            raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
+        flavoured["LPIPS"] = lpips_metric(protocol.lpips, *lpips_weights)
+    return [flavoured.get(metric.name, metric) for metric in metrics]
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:
