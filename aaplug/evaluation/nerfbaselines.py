@@ -65,7 +65,13 @@ class Aaplug:
         self.checkpoint = checkpoint
         if checkpoint is not None:
             folder = Path(checkpoint)
-            self.settings = _read_settings(folder / SETTINGS) | overrides
+            file = folder / SETTINGS
+            entry = object_of(read_json(file), file, "the settings", "recipe, quality and background", "background")
+            background = entry.vector("background", 3)
+            right = bool(((background >= 0) & (background <= 1)).all())
+            entry.place.expect(right, "background", "three numbers from 0 to 1", background.tolist())
+            stored = {name: entry.get(name, text) for name in DEFAULTS} | {"background": background.tolist()}
+            self.settings = stored | overrides
             self.scene, self.cameras = read_scene(folder / SCENE).gaussians(), read_cameras(folder / CAMERAS).all
         elif path is None or train_dataset is None:
             raise UsageError("--set scene", "name the file of the scene that was trained on this data set")
@@ -129,15 +135,6 @@ class Aaplug:
             sizes = {"w": c.width, "h": c.height, "cx": c.cx, "cy": c.cy, "fl_x": c.fx, "fl_y": c.fy}
             frames.append({"file_path": c.name, **sizes, "transform_matrix": pose.tolist()})
         write_texts(folder, {CAMERAS: as_json({"frames": frames}), SETTINGS: as_json(self.settings)}, overwrite=True)
-
-
-def _read_settings(file: Path) -> dict[str, Any]:
-    """The settings of a checkpoint; raises FormatError if they are not what `save` writes."""
-    entry = object_of(read_json(file), file, "the settings", "recipe, quality and background", "background")
-    background = entry.vector("background", 3)
-    right = bool(((background >= 0) & (background <= 1)).all())
-    entry.place.expect(right, "background", "three numbers from 0 to 1", background.tolist())
-    return {name: entry.get(name, text) for name in DEFAULTS} | {"background": background.tolist()}
 
 
 def _camera(camera: Any, name: str) -> Camera:

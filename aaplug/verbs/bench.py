@@ -6,7 +6,7 @@ from itertools import product
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
-from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.kernels import EAGER
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike
 from aaplug.methods.presets import find_recipe
@@ -18,7 +18,6 @@ from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_cam
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, counted
-from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
 TIMED = replace(find_recipe("classic"), levels=LevelChoice())
@@ -53,26 +52,20 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
             renderer = Renderer.of(job.scene, job.cameras, TIMED, rasterizer="eager", min_seen=0.0)
             view = job.cameras.train[0]
             work = [(renderer, view.resized(*size_of(text))) for text in options.resolution or ()] or [(renderer, view)]
-        kernels = _kernels(options.rasterizer, options.monitor)
+        kernels, compiled = [EAGER], None if options.rasterizer == "eager" else load()
+        if options.rasterizer == "compiled":
+            with options.monitor.progress("compiling", "kernels") as tell:
+                kernels = [compiled or build(tell)]
+        elif compiled is not None:
+            kernels = [compiled, EAGER]
+        elif options.rasterizer == "all":
+            options.monitor.say("rasterizer: eager only; `aaplug warmup` compiles the fast one")
         for (renderer, camera), each in product(work, kernels):
             run = measure(renderer, camera, each, options.repeats)
             shape = f"{counted(run.gaussians, 'Gaussian')}, {run.width}x{run.height}"
             options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))
-
-
-def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
-    if rasterizer == "eager":
-        return [EAGER]
-    compiled = load()
-    if rasterizer == "compiled":
-        with monitor.progress("compiling", "kernels") as tell:
-            return [compiled or build(tell)]
-    if compiled is None:
-        monitor.say("rasterizer: eager only; `aaplug warmup` compiles the fast one")
-        return [EAGER]
-    return [compiled, EAGER]
 
 
 def _synthetic(options: BenchOptions) -> list[tuple[Renderer, Camera]]:

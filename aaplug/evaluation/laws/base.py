@@ -16,10 +16,6 @@ LAWS: dict[str, list[Callable[[Any], None]]] = {}  # by kind
 L = TypeVar("L", bound=Callable[[Any], None])
 
 
-class LawError(AssertionError):
-    """An object breaks a law of its kind."""
-
-
 def law_of(kind: str) -> Callable[[L], L]:
     """Enter a function into the table; the first line of its docstring is the law."""
 
@@ -31,9 +27,9 @@ def law_of(kind: str) -> Callable[[L], L]:
 
 
 def require(holds: object, problem: str) -> None:
-    """Raise LawError with the problem unless the condition holds."""
+    """Raise AssertionError with the problem unless the condition holds."""
     if not holds:
-        raise LawError(problem)
+        raise AssertionError(problem)
 
 
 def copies_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
@@ -42,7 +38,7 @@ def copies_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
 
 
 def require_same(thing: Splats2D | Gaussians, before: dict[str, Tensor]) -> None:
-    """Raise LawError unless these tensors are as they were, to the bit."""
+    """Raise AssertionError unless these tensors are as they were, to the bit."""
     for name, value in before.items():
         require(getattr(thing, name).equal(value), f"changes {name}")
 

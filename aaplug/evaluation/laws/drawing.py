@@ -95,7 +95,7 @@ def rows_hold_colours(pixel: PixelKernel) -> None:
 
 
 def require_bounds(pixel: PixelKernel, splats: Splats2D, rules: Rules) -> None:
-    """Raise LawError where a pixel is drawn that lies outside of its splat's bounding ellipse."""
+    """Raise AssertionError where a pixel is drawn that lies outside of its splat's bounding ellipse."""
     ellipses = pixel.bounding_ellipses(splats, rules) or splats
     points = torch.cartesian_prod(*(torch.arange(-20, side + 20, 2.3, dtype=F64) for side in (64, 48)))
     meets_horizon = ellipses.opacities == 0  # such discs are not drawn
@@ -135,7 +135,7 @@ def draws_the_exact_image(pixel: PixelKernel) -> None:
 
 
 def require_same_image(image: Render, exact: Render) -> None:
-    """Raise LawError where two images differ by more than flips at a cut-off."""
+    """Raise AssertionError where two images differ by more than flips at a cut-off."""
     difference = (image.rgb.double() - exact.rgb).abs().amax(dim=2)
     require((difference > SAME).double().mean() < MAX_FLIPS, "differs by more than flips at a cut-off")
     require(difference.max() < 0.01, f"differs by {difference.max():.1e} at a pixel")
