@@ -10,6 +10,8 @@ import torch
 from aaplug.core.conventions import MIP, PLAYCANVAS
 from aaplug.core.gaussians import Fusion
 from aaplug.evaluation.engine import evaluate
+from aaplug.finetuning.parameters import between
+from aaplug.finetuning.session import tuned_scene
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 
@@ -49,10 +51,10 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
     torch.testing.assert_close(found.log_scales, expected)
 
 
-@pytest.mark.parametrize("viewer", ["classic", "gsplat"])
-def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer):
+@pytest.mark.parametrize(("viewer", "steps"), [("classic", "1"), ("gsplat", "16")])
+def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer, steps):
     """A viewer that draws as training did is right at the training size, and every step takes away from that."""
-    out, err = cli.done(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
+    out, err = cli.done(f"{CONVERT} --for {viewer} --steps {steps} --threads 1")
     assert [line for line in out.splitlines() if "converted" in line]
     found, compensated = read_scene(Path("c.ply")).gaussians(), viewer == "gsplat"
     assert (found.convention.kernel, found.convention.compensated) == (0.3, compensated)
@@ -63,7 +65,7 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer)
         return
     settings = dict(found.fused[-1].settings)
     partly = settings.pop("share", None)
-    assert settings == {"steps": "1", "for": viewer}
+    assert settings == {"steps": steps, "for": viewer}
     assert (partly is not None) == ("of the change" in err)
 
 
@@ -117,6 +119,37 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
     assert "starting from the original" in cli.done(f"{CONVERT} --for mip --steps 1")[1]
     original, found = (read_scene(Path(name)).gaussians().logit_opacities for name in ("scene.ply", "c.ply"))
     assert (found - original).abs().max() < 1
+
+
+def test_convert_keeps_the_original_where_nothing_is_as_close(cli, monkeypatch):
+    def dim(scene, *_):
+        return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
+
+    monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
+    monkeypatch.setattr(
+        "aaplug.finetuning.fitting.tuned_scene",
+        lambda *naming: replace(dim(tuned_scene(*naming)), fused=(Fusion("finetune"),)),
+    )
+    out, err = cli.done(f"{CONVERT} --for mip --steps 1 --json --threads 1")
+    assert "still worse than the original at some scale: keeping the original" in err
+    residual = json.loads(out)["residual"]
+    assert residual["converted@1"] == residual["original@1"]
+    original, found = (read_scene(Path(name)).gaussians() for name in ("scene.ply", "c.ply"))
+    assert (found.fused, found.convention) == ((), MIP)
+    assert torch.equal(found.logit_opacities, original.logit_opacities)
+
+
+def test_convert_keeps_the_closed_form_where_tuning_leads_away_from_it(cli, monkeypatch):
+    """Not as far as the original, so that no scale is worse than that."""
+
+    def spoilt(state, job, *naming):
+        return between(read_scene(Path("scene.ply")).gaussians(), tuned_scene(state, job, *naming), 0.7)
+
+    monkeypatch.setattr("aaplug.finetuning.fitting.tuned_scene", spoilt)
+    out, err = cli.done(f"{CONVERT} --for mip --steps 1 --json --threads 1")
+    assert "tuning did not bring it closer, over all scales: keeping the closed form" in err
+    residual = json.loads(out)["residual"]
+    assert (fused(), residual["converted@1"]) == (["matched-energy"], residual["closed form@1"])
 
 
 def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):

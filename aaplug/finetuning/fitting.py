@@ -1,6 +1,7 @@
-"""Fitting a scene to a viewer: the closed form, a short optimization, and a check that no scale became worse.
+"""Fitting a scene to a viewer: the closed form, a short optimization, and a check that it helped.
 
-Where tuning made one worse, parts of the change are tried, and then the closed form, if it is not worse itself.
+Where tuning made a scale worse than the original, parts of the change are tried.  The closed form or the original,
+whichever is closer, is kept where that does not help, or where tuning did not lower what it minimises.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance
+from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, Settings, balance
 from aaplug.finetuning.state import TuningJob
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
@@ -52,21 +53,20 @@ def fit(
     def report_of(result: Gaussians) -> Report:
         return before.with_more(measure({CONVERTED: replace(original, scene=result)}))
 
-    start = replace(original, scene=fuse_for(scene, original.training, viewer))
-    before = measure({ORIGINAL: original, CLOSED_FORM: start})
+    closed_form = start = replace(original, scene=fuse_for(scene, original.training, viewer))
+    renderers = {ORIGINAL: original, CLOSED_FORM: closed_form}
+    before = measure(renderers)
     if steps and _is_worse(before, CLOSED_FORM):
         problem = "the closed form, which `--steps 0` keeps, is worse than the original at some scale"
         monitor.say(f"{problem}: starting from the original")
         start = original
-    psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
-    errors = {s: 0.0 if dB is None else 10 ** (-dB / 10) for s, dB in psnr.items()}
-    settings = balance(replace(SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS, steps=steps), errors)
+    usual = SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS
+    settings = balance(replace(usual, steps=steps), _errors(before, ORIGINAL))
     recipes = [recipe_of(v) for v in (viewer, *(VIEWERS[name] for name in viewer.shown_by))]
     job = TuningJob(start, original.training.cameras, truth, settings, recipes=recipes)
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
-    closed_form = before.once_more(CLOSED_FORM, CONVERTED)
-    report = report_of(result) if steps else closed_form
+    report = report_of(result) if steps else before.once_more(CLOSED_FORM, CONVERTED)
     for part in PARTS_OF_CHANGE if state.step else ():
         if not _is_worse(report, CONVERTED):
             break
@@ -75,19 +75,33 @@ def fit(
         record = Fusion(tuning.method, tuning.settings | {"share": f"{part:g}"})
         result = replace(between(original.scene, tuned, part), fused=(*earlier, record))
         report = report_of(result)
+    losses = {row: _loss(report, row, settings) for row in (CLOSED_FORM, ORIGINAL, CONVERTED)}
+    problem = ""
     if state.step and _is_worse(report, CONVERTED):
-        kept = start is not original
-        then = "keeping the closed form" if kept else "read the table before you use it"
-        monitor.say(f"still worse than the original at some scale: {then}")
-        if kept:
-            result, report = start.scene, closed_form
+        problem = "still worse than the original at some scale"
+    elif state.step and start is closed_form and losses[CONVERTED] >= losses[CLOSED_FORM]:
+        problem = "tuning did not bring it closer, over all scales"
+    if problem:
+        kept = min(CLOSED_FORM, ORIGINAL, key=losses.__getitem__)
+        monitor.say(f"{problem}: keeping the {kept}")
+        result = replace(renderers[kept].scene, convention=viewer.convention_of(scene))
+        report = before.once_more(kept, CONVERTED)
     return result, report
 
 
+def _errors(report: Report, name: str) -> dict[float, float]:
+    """Mean square error of a row by scale, of its mean PSNR."""
+    psnr = {scale: mean(report.select(name, scale), PSNR.name) for scale in report.scales}
+    return {scale: 0.0 if dB is None else 10 ** (-dB / 10) for scale, dB in psnr.items()}  # None: equal to the truth
+
+
+def _loss(report: Report, name: str, settings: Settings) -> float:
+    """What tuning minimises, of a row."""
+    errors = _errors(report, name)
+    return settings.anchor * errors[1.0] + sum(weight * errors[scale] for scale, weight in settings.weights.items())
+
+
 def _is_worse(report: Report, name: str) -> bool:
-    """True if a row has a lower PSNR than the original at any scale; None means equal to the truth."""
-    for scale in report.scales:
-        before, after = (mean(report.select(n, scale), PSNR.name) for n in (ORIGINAL, name))
-        if after is not None and (before is None or after < before):
-            return True
-    return False
+    """True if a row has a larger error than the original at any scale."""
+    before, after = (_errors(report, row) for row in (ORIGINAL, name))
+    return any(after[scale] > before[scale] for scale in report.scales)
