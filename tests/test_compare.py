@@ -188,6 +188,10 @@ def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
     rough = replace(lopsided, means=lopsided.means + 0.02 * noise)
     for other in (lopsided, shuffled(lopsided), lopsided[:50], rough, shuffled(rough), lopsided[:0]):
         assert mismatch(lopsided, other) is None
+    turned = carried(
+        lopsided, [[1, -1e-4, 0], [1e-4, 1, 0], [0, 0, 1]]
+    )  # too little to name, yet it moves a far origin
+    assert mismatch(*(replace(scene, means=scene.means + 3e3) for scene in (lopsided, turned))) is None
     line = replace(lopsided[:50], means=torch.linspace(-1, 1, 50)[:, None] * torch.ones(3) + 900)
     assert mismatch(lopsided, line).startswith("elsewhere: half of its Gaussians lie 1")
 

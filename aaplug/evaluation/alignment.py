@@ -10,7 +10,7 @@ n: Gaussians, p: points.  Places are float64, in world units.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations, product
 
@@ -46,23 +46,35 @@ class Similarity:
     scale: float
     shift: Float[Tensor, " 3"]
 
+    def done(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+        """The points after the transform."""
+        return self.scale * points @ self.rotation.T + self.shift
+
     def undone(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
         """The points before the transform."""
         return (points - self.shift) @ self.rotation / self.scale
 
-    def described(self, size: float) -> str:
-        """In words, without what is small; size: of the scene, in world units."""
+    def described(self, scene: "Cloud") -> str:
+        """In words, without what is small.
+
+        What is left is told as a shift of the scene's middle: an unnamed turn moves what lies far from the origin.
+        """
         rotation, parts = self.rotation.clone(), list[str]()
+        named = Similarity(torch.eye(3).to(rotation), 1.0, torch.zeros_like(self.shift))
         if torch.linalg.det(rotation) < 0:
             axis = min(range(3), key=lambda i: float(rotation[i, i]))  # the axis that leaves the smallest turn
             rotation[:, axis] *= -1
+            named.rotation[axis, axis] = -1
             parts.append(f"mirrored along {'xyz'[axis]}")
         if turn := _turn(rotation):
+            named = replace(named, rotation=self.rotation)
             parts.append(turn)
         if abs(self.scale - 1) > UNNAMED_CHANGE:
+            named = replace(named, scale=self.scale)
             parts.append(f"scaled by {self.scale:.3g}")
-        if float(self.shift.norm()) > UNNAMED_CHANGE * size:
-            shift = [x if abs(x) > UNNAMED_CHANGE * size else 0.0 for x in self.shift.tolist()]
+        shift, least = self.done(scene.middle) - named.done(scene.middle), UNNAMED_CHANGE * scene.size
+        if float(shift.norm()) > least:
+            shift = [x if abs(x) > least else 0.0 for x in shift.tolist()]
             parts.append(f"moved by ({', '.join(f'{x:.3g}' for x in shift)})")
         return ", ".join(parts)
 
@@ -123,7 +135,7 @@ def mismatch(reference: Gaussians, other: Gaussians) -> str | None:
         return None
     places, queries = Cloud.of(reference, MAX_PLACES), Cloud.of(other, MAX_QUERIES)
     if len(reference) == len(other) and (pairs := _from_pairs(reference, other)) is not None:
-        return pairs.described(places.size) or None
+        return pairs.described(places) or None
     apart = places.apart(queries.points)
     if apart <= CERTAIN_DISTANCE * places.spacing:
         return None
@@ -132,7 +144,7 @@ def mismatch(reference: Gaussians, other: Gaussians) -> str | None:
     distances = [places.apart(t.undone(queries.points), most) for t in candidates]
     if (least := min(distances)) < math.inf:
         simplest = next(place for place, distance in enumerate(distances) if distance <= SIMPLER_FACTOR * least)
-        return candidates[simplest].described(places.size) or None
+        return candidates[simplest].described(places) or None
     if apart > ELSEWHERE_DISTANCE * places.size:
         return f"elsewhere: half of its Gaussians lie {apart / places.size:.2g} times the scene's size or more away"
     return None
