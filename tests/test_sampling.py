@@ -175,6 +175,7 @@ def test_cameras_of_another_scene_are_refused():
     assert caught.value.where == "garden.ply"
     assert "7 cameras" in caught.value.problem
     assert "dataparser_transforms.json" in caught.value.problem
+    assert "nothing nearer than 0.2 units" in caught.value.problem
     assert check_frame(means, strangers, "garden.ply", min_share=0.0) < 0.5
 
 

@@ -128,7 +128,8 @@ def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_shar
         raise FrameError(
             scene_name,
             f"only {share:.1%} of its Gaussians are seen by any of {counted(cameras, 'camera')} (expected at least "
-            f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
+            f"{min_share:.0%}): scene and cameras are in different frames, or the scene is too small for 3DGS, which "
+            f"draws nothing nearer than {NEAR:g} units. nerfstudio scenes need the transform of "
             "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
             "off; if the cameras are right nevertheless, lower `min_seen`",
         )

@@ -37,7 +37,8 @@ class Agreement:
 
     seen: share of the Gaussians that any camera sees.
     size: median standard deviation along a Gaussian's middle axis at its highest training rate, in px; None if unseen.
-    offset: distance of the scene's middle from the image's centre in the median view, as a share of the side.
+    offset: distance of the scene's middle from the image's centre in the median view, as a share of the side; infinite
+        where no Gaussian lies ahead.
     gain: how much closer renders come to the photographs than one flat colour does, in dB; None without photographs.
     """
 
@@ -53,6 +54,8 @@ class Agreement:
             if self.gain > 0:
                 return None
             return f"renders are {-self.gain:.1f} dB farther from the photographs than one flat colour is"
+        if math.isinf(self.offset):
+            return f"in half of the views no Gaussian lies farther ahead than {NEAR:g} units; nearer ones are not drawn"
         if self.offset > HALF_A_SIDE:
             return "in half of the views the middle of the scene lies outside of the image"
         return None
