@@ -83,7 +83,7 @@ def fit(
         problem = "tuning did not bring it closer, over all scales"
     if problem:
         kept = min(CLOSED_FORM, ORIGINAL, key=losses.__getitem__)
-        monitor.say(f"{problem}: keeping the {kept}")
+        monitor.say(f"{problem}: keeping the {kept}, which is closer over all scales")
         result = replace(renderers[kept].scene, convention=viewer.convention_of(scene))
         report = before.once_more(kept, CONVERTED)
     return result, report
