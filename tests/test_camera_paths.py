@@ -2,12 +2,14 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from aaplug.core import camera_paths as paths
 from aaplug.core.cameras import CameraSet
+from aaplug.core.lenses import PINHOLE, Lens
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import sniff
 from aaplug.system.errors import FormatError
@@ -37,6 +39,16 @@ def test_an_orbit_keeps_distance_and_looks_at_the_pivot(t):
     assert pivot.tolist() == pytest.approx([0.0, 0.0, 4.0], abs=1e-6)
     angle = math.atan2(camera.centre[1], camera.centre[0])
     assert math.cos(angle + math.pi / 2) == pytest.approx(math.cos(2 * math.pi * t))
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, Lens("equidistant")])
+def test_paths_keep_what_the_middle_shows_where_the_principal_point_is_far_off(lens):
+    view = replace(VIEW, cx=-1.5 * VIEW.width, cy=0.2 * VIEW.height, lens=lens)
+    middle = torch.tensor([view.width / 2, view.height / 2], dtype=torch.float64)
+    ray = view.rays(middle) @ view.cam_from_world[:3, :3]
+    shown = view.centre + 4.0 / (view.cam_from_world[2, :3] @ ray) * ray
+    for camera in (paths.zoomed(view, 0.25), paths.moved(view, 0.25, 4.0), paths.orbit(view, 0.3, 4.0, UP)):
+        torch.testing.assert_close(camera.project(shown[None])[0][0], middle)
 
 
 def test_up_is_what_is_up_in_the_images():

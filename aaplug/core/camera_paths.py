@@ -1,7 +1,8 @@
 """Cameras made of other cameras: paths that show aliasing, and free views between those of a data set.
 
 t runs over [0, 1).  Zoom and dolly go from `start` to `end` and back; both are factors on the sampling rate.  Speed is
-even in octaves and eases at both ends.  An orbit goes once around.  All three are loops.
+even in octaves and eases at both ends.  An orbit goes once around.  All three are loops, and keep what the middle of
+the image shows there, wherever the principal point is.
 """
 
 import math
@@ -13,20 +14,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet, numbered, rigid_motion
+from aaplug.core.lenses import ORTHO
 
 NEIGHBOURS = 6  # cameras nearest to each, between which and itself its free views lie
 LEAST_SHARE, LARGEST_SHARE = 0.2, 0.8  # of the way to the neighbour
 
 
 def zoomed(view: Camera, by: float) -> Camera:
-    """The view with its focal length multiplied; pose and size stay."""
-    return replace(view, fx=view.fx * by, fy=view.fy * by)
+    """The view with its focal length multiplied, about the middle of the image; pose and size stay."""
+    x, y = view.width / 2, view.height / 2
+    return replace(view, fx=view.fx * by, fy=view.fy * by, cx=x + by * (view.cx - x), cy=y + by * (view.cy - y))
 
 
 def moved(view: Camera, by: float, depth: float) -> Camera:
-    """A free camera, moved along the view's axis so that a point at `depth` (world units) is at depth / by."""
+    """A free camera, moved along the ray of the image's middle: from a point at `depth` (world units) to depth / by."""
     pose = view.cam_from_world.clone()
-    pose[2, 3] += depth * (1 / by - 1)
+    pose[:3, 3] += depth * (1 / by - 1) * _ahead(view)
     return replace(view, cam_from_world=pose, trained_focal=None)
 
 
@@ -37,16 +40,23 @@ def factor(t: float, start: float, end: float) -> float:
 
 
 def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:
-    """The view turned about the axis `up` through the point `depth` world units ahead, as a free camera.
+    """The view turned about the axis `up` through what the image's middle shows at a depth, as a free camera.
 
-    up: of length 1.
+    depth: in world units.  up: of length 1.
     """
     from scipy.spatial.transform import Rotation  # takes a third of a second to import
 
-    pivot = view.centre + depth * view.cam_from_world[2, :3]
+    pivot = view.centre + depth * _ahead(view) @ view.cam_from_world[:3, :3]
     turn = torch.from_numpy(Rotation.from_rotvec(2 * math.pi * t * up.double().numpy()).as_matrix())
     pose = view.cam_from_world @ rigid_motion(turn, pivot - turn @ pivot)
     return replace(view, cam_from_world=pose, trained_focal=None)
+
+
+def _ahead(view: Camera) -> Float[Tensor, " 3"]:
+    """The ray of the image's middle in the camera's frame, where z is 1; the axis, if that ray does not lead ahead."""
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    ray = axis if view.lens == ORTHO else view.rays(axis.new_tensor([view.width / 2, view.height / 2]))
+    return ray / ray[2] if ray[2] > 0 else axis
 
 
 def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
