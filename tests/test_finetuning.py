@@ -11,9 +11,11 @@ from skimage.metrics import structural_similarity as ssim_of_skimage
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians, digest_of_scene
+from aaplug.core.imaging import quantised
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.fitting import fit
@@ -86,6 +88,17 @@ def test_steps_draw_by_several_rules_in_turn(monkeypatch):
         one = replace(make_job(), recipes=[recipes[state.step % 3]])
         assert loss_at(job, state, VIEWS[0], 0.5)[0] == loss_at(one, state, VIEWS[0], 0.5)[0]
     assert len({replace(job, recipes=turns).facts["recipe"] for turns in (recipes, recipes[::-1], ())}) == 3
+
+
+def test_a_scene_for_several_rules_is_measured_by_each():
+    look = make_job().truth.renderer
+    result, report = fit(make_scene(60), VIEWERS["khr"], look, VIEWS, 0)
+    programs = {"": "khr", " in CesiumJS 1.145.0": "cesium", " in Babylon.js 9.35.0": "babylon-classic"}
+    for program, name in programs.items():
+        shown = replace(look, scene=result, recipe=recipe_of(VIEWERS[name]))
+        [figure] = (m for m in report.select("converted" + program, 1.0) if m.view == VIEWS[0].name)
+        expected = psnr(*(quantised(renderer(VIEWS[0]).rgb) for renderer in (shown, look)))
+        assert figure.values["PSNR"] == pytest.approx(expected, abs=0.01)  # the truth is kept in half precision
 
 
 # losses

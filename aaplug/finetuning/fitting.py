@@ -6,6 +6,8 @@ whichever is closer, is kept where that does not help, or where tuning did not l
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
+from statistics import fmean
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
@@ -15,7 +17,7 @@ from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, Settings, balance
+from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance
 from aaplug.finetuning.state import TuningJob
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
@@ -44,40 +46,58 @@ def fit(
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
     original = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
+    recipes = {"": original.recipe}  # by what they add to the names of rows
+    recipes |= {f" in {VIEWERS[name].program}": recipe_of(VIEWERS[name]) for name in viewer.shown_by}
 
     def measure(renderers: Mapping[str, Renderer]) -> Report:
+        rows = {name + by: replace(r, recipe=recipe) for by, recipe in recipes.items() for name, r in renderers.items()}
         with monitor.progress("measuring", "views") as tell:
-            task = Task(renderers, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
+            task = Task(rows, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
             return evaluate(task, tell=tell)
+
+    def as_converted(name: str) -> Report:
+        return reduce(lambda report, by: report.once_more(name + by, CONVERTED + by), recipes, before)
 
     def report_of(result: Gaussians) -> Report:
         return before.with_more(measure({CONVERTED: replace(original, scene=result)}))
 
+    def errors_of(report: Report, name: str) -> dict[float, float]:
+        """Mean square error of a row by scale, of its mean PSNR, as a mean over the rules."""
+        psnr = {s: [mean(report.select(name + by, s), PSNR.name) for by in recipes] for s in report.scales}
+        return {s: fmean(0.0 if dB is None else 10 ** (-dB / 10) for dB in values) for s, values in psnr.items()}
+
+    def is_worse(report: Report, name: str) -> bool:
+        before, after = (errors_of(report, row) for row in (ORIGINAL, name))
+        return any(after[scale] > before[scale] for scale in report.scales)
+
+    def loss_of(report: Report, name: str) -> float:
+        errors = errors_of(report, name)
+        return settings.anchor * errors[1.0] + sum(weight * errors[s] for s, weight in settings.weights.items())
+
     closed_form = start = replace(original, scene=fuse_for(scene, original.training, viewer))
     renderers = {ORIGINAL: original, CLOSED_FORM: closed_form}
     before = measure(renderers)
-    if steps and _is_worse(before, CLOSED_FORM):
+    if steps and is_worse(before, CLOSED_FORM):
         problem = "the closed form, which `--steps 0` keeps, is worse than the original at some scale"
         monitor.say(f"{problem}: starting from the original")
         start = original
     usual = SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS
-    settings = balance(replace(usual, steps=steps), _errors(before, ORIGINAL))
-    recipes = [recipe_of(v) for v in (viewer, *(VIEWERS[name] for name in viewer.shown_by))]
-    job = TuningJob(start, original.training.cameras, truth, settings, recipes=recipes)
+    settings = balance(replace(usual, steps=steps), errors_of(before, ORIGINAL))
+    job = TuningJob(start, original.training.cameras, truth, settings, recipes=[*recipes.values()])
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
-    report = report_of(result) if steps else before.once_more(CLOSED_FORM, CONVERTED)
+    report = report_of(result) if steps else as_converted(CLOSED_FORM)
     for part in PARTS_OF_CHANGE if state.step else ():
-        if not _is_worse(report, CONVERTED):
+        if not is_worse(report, CONVERTED):
             break
         monitor.say(f"worse than the original at some scale: taking {part:g} of the change")
         *earlier, tuning = tuned.fused
         record = Fusion(tuning.method, tuning.settings | {"share": f"{part:g}"})
         result = replace(between(original.scene, tuned, part), fused=(*earlier, record))
         report = report_of(result)
-    losses = {row: _loss(report, row, settings) for row in (CLOSED_FORM, ORIGINAL, CONVERTED)}
+    losses = {row: loss_of(report, row) for row in (CLOSED_FORM, ORIGINAL, CONVERTED)}
     problem = ""
-    if state.step and _is_worse(report, CONVERTED):
+    if state.step and is_worse(report, CONVERTED):
         problem = "still worse than the original at some scale"
     elif state.step and start is closed_form and losses[CONVERTED] >= losses[CLOSED_FORM]:
         problem = "tuning did not bring it closer, over all scales"
@@ -85,23 +105,5 @@ def fit(
         kept = min(CLOSED_FORM, ORIGINAL, key=losses.__getitem__)
         monitor.say(f"{problem}: keeping the {kept}, which is closer over all scales")
         result = replace(renderers[kept].scene, convention=viewer.convention_of(scene))
-        report = before.once_more(kept, CONVERTED)
+        report = as_converted(kept)
     return result, report
-
-
-def _errors(report: Report, name: str) -> dict[float, float]:
-    """Mean square error of a row by scale, of its mean PSNR."""
-    psnr = {scale: mean(report.select(name, scale), PSNR.name) for scale in report.scales}
-    return {scale: 0.0 if dB is None else 10 ** (-dB / 10) for scale, dB in psnr.items()}  # None: equal to the truth
-
-
-def _loss(report: Report, name: str, settings: Settings) -> float:
-    """What tuning minimises, of a row."""
-    errors = _errors(report, name)
-    return settings.anchor * errors[1.0] + sum(weight * errors[scale] for scale, weight in settings.weights.items())
-
-
-def _is_worse(report: Report, name: str) -> bool:
-    """True if a row has a larger error than the original at any scale."""
-    before, after = (_errors(report, row) for row in (ORIGINAL, name))
-    return any(after[scale] > before[scale] for scale in report.scales)
