@@ -16,8 +16,10 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Task, evaluate
+from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import sheet_of
-from aaplug.evaluation.results import Report, results
+from aaplug.evaluation.results import Report, results, scale_name
+from aaplug.evaluation.results import mean as mean_of
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
@@ -36,7 +38,7 @@ from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import OutputError, UsageError, counted
+from aaplug.system.errors import OutputError, UsageError, counted, listing
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import IS_COMPLETE, writes
@@ -141,6 +143,13 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         truth = replace(truth, source=source_of(job.views))
         with job.monitor.progress("measuring", "views") as tell:
             report = evaluate(Task(renderers, scales, job.views, truth, ceiling=False), tell=tell)
+        for name in ("before", *closed) if state.step else ():
+            psnr = ([mean_of(report.select(row, s), PSNR.name) for row in (name, "after")] for s in scales)
+            lost = (was - now if was and now else 0.0 for was, now in psnr)
+            worse = [scale_name(scale) for scale, dB in zip(scales, lost, strict=True) if round(dB, PSNR.digits) > 0]
+            if worse:
+                problem = f"tuning left the measured views worse than {name} at {listing(worse)}"
+                job.monitor.say(f"{problem}: fewer steps, a lower learning rate or more training views may help")
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
             told = json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1)
