@@ -81,10 +81,16 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
     assert sorted(bytes_of("out")) == ["f.json"]
 
 
+VIDEO = "a video holds 8-bit sRGB colours alone and is not resumed"
 REFUSED = {
     "v.%04d.exr": "name a .webm or .mp4 file, or frames such as name.####.png",
-    "v.webm --transparent": "8-bit colours and is not resumed; name a sequence, such as frames/frame.####.exr",
-    "v.webm --resume": "a video holds 8-bit colours and is not resumed",
+    "v.webm --transparent": f"--transparent: {VIDEO}; name a sequence, such as frames/frame.####.exr",
+    "v.webm --resume": f"--resume: {VIDEO}",
+    "v.mp4 --colour linear": f"--colour: {VIDEO}",
+    "v.mp4 --passes rgb,depth": f"--passes: {VIDEO}",
+    "v.mp4 --bit-depth 16": f"--bit-depth: {VIDEO}",
+    "v.mp4 --format exr": f"--format: {VIDEO}",
+    "v.mp4 --lens fisheye": "--lens: fisheye sets its own angle, which zoom would change; give --path dolly or orbit",
     "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",
     "##/a.png": "name a .webm or .mp4 file",
     "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",

@@ -180,6 +180,7 @@ REFUSED = {
     "a.png --format exr": "--format: is exr, but a.png is named as a .png",
     "a.png --transparent --background white": "--background: is not stored where alpha is",
     "a.gif": "name a folder, or one .png",
+    "a.mp4": "name a folder, or one .png",
 }
 
 

@@ -154,12 +154,12 @@ VR = "--cameras . --lens vr180 --eye-distance 0.4 --resolution 24x24 --rasterize
 
 
 def test_both_eyes_are_side_by_side_in_a_video(cli):
-    cli.done(f"video scene.ply {VR} -o v.webm --seconds 0.1")
+    cli.done(f"video scene.ply {VR} -o v.webm --path orbit --seconds 0.1")
     frames, _ = read(Path("v.webm"))
     assert frames.shape[2] == 2 * frames.shape[1] == 48
     left, right = np.split(frames.astype(float), 2, axis=2)
     assert np.abs(left - right).max() > 20
-    cli.refused(f"video scene.ply {VR} -o frames/frame.####.png --seconds 0.1", "`render --path` writes both")
+    cli.refused(f"video scene.ply {VR} -o a/b.####.png --path orbit --seconds 0.1", "`render --path` writes both")
 
 
 def test_the_shutter_of_an_eye_follows_that_eye(cli, monkeypatch):

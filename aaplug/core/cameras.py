@@ -29,6 +29,7 @@ MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays f
 MAX_DISTANCE = 1e18  # world units from the origin; its square fits into float32
 MIN_SINE = 1e-12  # between the direction of sight and up
 MAX_BLADES = 64
+NEEDS_PINHOLE = "an aperture needs a pinhole without distortion"
 MAX_EXPOSURES = 4096  # frames averaged to one
 MAX_ROTATION_ERROR = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
 MAX_LAST_ROW_ERROR = 1e-6  # the same of the row 0 0 0 1, which some inverses round, too
@@ -93,8 +94,7 @@ class Camera:
             object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
             self._check_pose()
             if self.lens != PINHOLE and self.exposure is not None and self.exposure.aperture is not None:
-                got = f"a distorted {self.lens.projection}" if self.lens.distorts else self.lens.projection
-                raise UsageError("exposure", f"an aperture needs a pinhole without distortion, got {got}")
+                raise UsageError("exposure", f"{NEEDS_PINHOLE}, got {self.lens.kind}")
         except UsageError as error:
             if error.where == "name" or not self.name:
                 raise

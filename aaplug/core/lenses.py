@@ -62,6 +62,11 @@ class Lens:
         return any((*self.radial, *self.rational, *self.tangential, *self.prism))
 
     @property
+    def kind(self) -> str:
+        """The projection, and that it is distorted, in words."""
+        return f"a distorted {self.projection}" if self.distorts else self.projection
+
+    @property
     def flat(self) -> bool:
         """True if splats are Gaussians in the pinhole's image plane, as training's were; else across their ray."""
         return self.projection in ("pinhole", "ortho")

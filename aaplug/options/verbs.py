@@ -103,6 +103,9 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
             paths = RECEDING_PATHS if name in ("start", "end") else BUILT_IN_PATHS
             if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
                 raise UsageError(name, f"is for the paths {listing(paths)}, not for {self.path}")
+        if str(self.path) == "zoom" and self.lens not in (None, "pinhole", "ortho"):
+            problem = f"{self.lens} sets its own angle, which zoom would change; give `path` dolly or orbit"
+            raise UsageError("lens", problem)
 
 
 @dataclass(frozen=True, kw_only=True)

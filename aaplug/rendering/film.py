@@ -6,7 +6,8 @@ from dataclasses import replace
 import torch
 
 from aaplug.core.camera_paths import toward
-from aaplug.core.cameras import Aperture, Camera, Exposure
+from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
+from aaplug.core.lenses import PINHOLE
 from aaplug.options.shared import DEFAULT_SENSOR, FilmOptions
 from aaplug.system.errors import UsageError
 
@@ -26,8 +27,8 @@ def filmed(
     options: they win over what the views say, and over `shutter`, which is of the path's file.
     camera_to: for one view, the camera where the shutter closes.
 
-    Raises UsageError if the focus lies behind a camera, nothing moves, sizes or kinds of lenses differ along a motion,
-    or samples of nothing are asked for.
+    Raises UsageError if an aperture is asked for through a lens that bends, the focus lies behind a camera, nothing
+        moves, sizes or kinds of lenses differ along a motion, or samples of nothing are asked for.
     """
     shutter = shutter if options.shutter is None else options.shutter
     if options.samples == 0:
@@ -79,6 +80,8 @@ def _aperture(view: Camera, options: FilmOptions) -> Aperture | None:
     """The aperture that the options give the view, or else its own."""
     if options.f_stop is None:
         return view.exposure and view.exposure.aperture
+    if view.lens != PINHOLE:
+        raise UsageError("f_stop", f"{NEEDS_PINHOLE}, got {view.lens.kind}; give `lens` pinhole")
     focus = options.focus_distance
     if options.focus_at is not None:
         place = torch.tensor([options.focus_at], dtype=torch.float64)

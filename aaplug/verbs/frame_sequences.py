@@ -13,7 +13,6 @@ from typing import Any
 
 from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, write_file
-from aaplug.io.video import CODECS
 from aaplug.system.errors import FormatError, OutputError, counted, listing
 from aaplug.verbs.views import SUFFIXES, names_image
 
@@ -36,8 +35,7 @@ class FrameSequence:
         Raises OutputError if the name has places for more than one number, or is that of no format.
         """
         if not PLACES.search(output.name):
-            is_file = names_image(output) or output.suffix.lower() in CODECS
-            return None if format is None or is_file else cls(output / f"{USUAL_NAME}.{format}")
+            return None if format is None or names_image(output) else cls(output / f"{USUAL_NAME}.{format}")
         if len(PLACES.findall(output.name)) > 1:
             raise OutputError(output, "has places for two numbers; name a sequence such as frame.####.exr")
         if output.suffix.lower() not in SUFFIXES:

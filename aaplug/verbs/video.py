@@ -19,7 +19,7 @@ from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.image_formats import PNG, Storage
+from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import CODECS, check_video, write_video
@@ -27,7 +27,7 @@ from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import OutputError, UsageError, counted, listing
+from aaplug.system.errors import UsageError, counted, listing
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.frame_sequences import FrameSequence
@@ -37,7 +37,15 @@ from aaplug.verbs.views import drawn, storage_of
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px
 MAX_FRAMES = 100_000
-SEQUENCE = "such as frames/frame.####.exr"
+SEQUENCE = "name a sequence, such as frames/frame.####.exr"
+IN_VIDEO = {  # what a video can hold of the options of image files
+    "format": (None,),
+    "passes": ("rgb", ["rgb"], ("rgb",)),
+    "transparent": (False,),
+    "colour": (None, "srgb"),
+    "bit_depth": (None, 8),
+    "resume": (False,),
+}
 
 
 class Clip(NamedTuple):
@@ -63,9 +71,11 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     """
     target = Path("video.webm" if output is None else output)
     sequence = FrameSequence.of(target, options.format)
+    if sequence is None and target.suffix.lower() in CODECS:
+        for name, held in IN_VIDEO.items():
+            if getattr(options, name) not in held:
+                raise UsageError(name, f"a video holds 8-bit sRGB colours alone and is not resumed; {SEQUENCE}")
     storage, options = storage_of(target if sequence is None else sequence.pattern, options)
-    if sequence is None and target.suffix.lower() in CODECS and (storage != PNG or options.resume):
-        raise OutputError(target, f"a video holds 8-bit colours and is not resumed; name a sequence, {SEQUENCE}")
     if options.lens == "vr180" and sequence is not None:
         raise UsageError("lens", "vr180 is a pair of images, of which a sequence has one: `render --path` writes both")
     alone = sequence is not None or options.lens == "vr180"

@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import NEEDS_PINHOLE, Camera
 from aaplug.core.colours import BLACK
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.atomic import check_output, refuse_existing
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage
+from aaplug.io.video import CODECS
 from aaplug.options.shared import check_side, size_of
 from aaplug.options.verbs import RenderOptions, VideoOptions
 from aaplug.rendering.film import filmed
@@ -21,7 +22,7 @@ from aaplug.rendering.job import Job
 from aaplug.system.errors import OutputError, UsageError, counted
 
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
-IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
+IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif", *CODECS)  # any other name is a folder
 Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
@@ -51,6 +52,8 @@ def _seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camer
     """
     options = job.options
     views = [replace(view, exposure=None) for view in views] if options.samples == 0 else views
+    if options.lens not in (None, "pinhole") and any(view.exposure and view.exposure.aperture for view in views):
+        raise UsageError("lens", f"{NEEDS_PINHOLE}; `samples` of 0 leaves out that of the path file")
     bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
     if options.resolution is None:
         sized = [view.scaled(options.scale or 1.0) for view in bent]
