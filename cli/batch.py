@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import aaplug
-from aaplug.options.base import DRAWING, flag
+from aaplug.options.base import DRAWING, as_path, flag
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.system.errors import FormatError, UsageError, did_you_mean
 
@@ -23,7 +23,7 @@ ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the who
 
 BATCH = Option(
     "batch",
-    flag("FILE.toml", read=Path),
+    flag("FILE.toml", read=as_path),
     "File of scenes and their settings, for an --output folder; options given here hold where it says nothing.",
 )
 SEVERAL = (  # options of a verb that `for_each_scene` repeats

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import aaplug
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
-from aaplug.options.base import CAMERAS, Group, Options, flag, names, number
+from aaplug.options.base import CAMERAS, Group, Options, as_path, flag, names, number
 from aaplug.options.shared import SCALE, Orbit
 from aaplug.system.errors import FormatError, UsageError, counted
 
@@ -40,9 +40,9 @@ class FileOptions(Options):
 class SceneOptions(FileOptions):
     """The scene."""
 
-    scene: Annotated[Path | None, flag("[SCENE]", read=Path, by_place=True)] = None
+    scene: Annotated[Path | None, flag("[SCENE]", read=as_path, by_place=True)] = None
     """A scene file (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels or frames."""
-    model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
+    model_path: Annotated[Path | None, flag("FOLDER", "-m", read=as_path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None
     """Iteration of a model folder (default: the last)."""
@@ -52,7 +52,7 @@ class SceneOptions(FileOptions):
 class CameraOptions(Options):
     """The cameras."""
 
-    cameras: Annotated[Path | None, flag("PATH", read=Path)] = None
+    cameras: Annotated[Path | None, flag("PATH", read=as_path)] = None
     """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's own)."""
     train_scale: Annotated[float | None, SCALE, CAMERAS] = None
     """Training size relative to the cameras' source size, where the files do not say."""

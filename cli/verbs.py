@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import aaplug
 from aaplug.options import verbs
-from aaplug.options.base import REPORT, Options, flag, names, number
+from aaplug.options.base import REPORT, Options, as_path, flag, names, number
 from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
@@ -158,14 +158,14 @@ def finetune(words: Words) -> Answer:
     SceneOptions,
     Option(
         "more",
-        flag("[SCENE ...]", read=Path, by_place=True, count=None),
+        flag("[SCENE ...]", read=as_path, by_place=True, count=None),
         "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
         (),
     ),
     BATCH,
     Option(
         "models",
-        flag("FOLDER", read=Path),
+        flag("FOLDER", read=as_path),
         "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
     ),
     Option("skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False),
@@ -218,11 +218,11 @@ def video(words: Words) -> Answer:
 @verb(
     Option(
         "scenes",
-        flag("SCENE SCENE [SCENE ...]", read=Path, by_place=True, count=None),
+        flag("SCENE SCENE [SCENE ...]", read=as_path, by_place=True, count=None),
         "Two or more scenes of any format, or their folders; the others are compared with the first.",
         (),
     ),
-    Option("reference", flag("SCENE", read=Path), "The scene to compare the others with, instead of the first."),
+    Option("reference", flag("SCENE", read=as_path), "The scene to compare the others with, instead of the first."),
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
@@ -261,7 +261,9 @@ def compare(words: Words) -> Answer:
 
 
 @verb(
-    Option("scenes", flag("SCENE [SCENE ...]", read=Path, by_place=True, count=None), "The scenes, of any format.", ()),
+    Option(
+        "scenes", flag("SCENE [SCENE ...]", read=as_path, by_place=True, count=None), "The scenes, of any format.", ()
+    ),
     CameraOptions,
     output("FILE", WRITTEN + "."),
     verbs.MergeOptions,
@@ -376,7 +378,7 @@ def view(words: Words) -> Answer:
     ),
     Option(
         "bundle",
-        flag("FOLDER", read=Path),
+        flag("FOLDER", read=as_path),
         "Compile into a folder, for other machines with the same torch: for x86-64-v3 and x86-64-v4."
         " Where AAPLUG_KERNELS names the folder, no compiler is needed.",
     ),
@@ -414,7 +416,7 @@ def check_plugin(words: Words) -> Answer:
         "A command line in quotes, in which {scene}, {camera} and {image} stand for the .ply, the camera's .json and"
         " the .png to write; without them, the three are added at the end.",
     ),
-    Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png."),
+    Option("images", flag("FOLDER", read=as_path), "Instead: pictures made by hand, such as dilation.png."),
     output("FOLDER", "Folder for scenes, cameras and pictures; alone, it gets the expected pictures.", None),
     verbs.ConformOptions,
     json_of("the verdicts as one JSON object"),

@@ -11,15 +11,14 @@ from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
 from io import StringIO
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
-from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, docs_of, flag
+from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, as_path, docs_of, flag
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, AaplugError, UsageError, did_you_mean, within_memory
 
 # a word that names a file, unlike names and numbers such as 1/4
 FILE = re.compile(r"(?!\.?\d[\d./,]*$)(.*/.*|.*\.[A-Za-z]\w*)", re.DOTALL)
-OPTION = re.compile(r"-(?![\d.])")  # the beginning of a word that is no negative number
+OPTION = re.compile(r"-(?![\d.]|$)")  # the beginning of a word that is no negative number, nor a lone dash
 MAX_METAVAR = 30  # characters; longer lists of names stand in an option's help
 SILENT_DEFAULTS = (None, False, True, (), math.inf)  # that help does not show
 
@@ -90,7 +89,7 @@ class Option(NamedTuple):
 
 def output(metavar: str, text: str, default: Any = MISSING) -> Option:
     """The option that names what to write."""
-    return Option("output", flag(metavar, "-o", read=Path), text, default)
+    return Option("output", flag(metavar, "-o", read=as_path), text, default)
 
 
 def json_of(what: str) -> Option:

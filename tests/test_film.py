@@ -188,6 +188,11 @@ def test_a_lens_that_bends_moves_but_has_no_aperture():
     assert not torch.equal(renderer(moving).rgb, renderer(panorama).rgb)
 
 
+def test_a_camera_to_is_one_view_for_one():
+    with pytest.raises(UsageError, match=r"camera_to: names one view, for one of `views` .*; got 1 view for 2 views"):
+        filmed([VIEW, VIEW], FilmOptions(), False, camera_to=[MOVED])
+
+
 @pytest.mark.parametrize(
     ("end", "says"),
     [

@@ -11,6 +11,7 @@ import pytest
 from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
 
+from aaplug.io.batch_file import read_batch
 from aaplug.options.base import Number, Options, names
 from aaplug.system.errors import UsageError
 from tests.conftest import run_python
@@ -78,6 +79,8 @@ REFUSED = {
     "render s.ply": "Missing: -o PATH, --output PATH: A folder for the images, or one file for one view: .png",
     "render --nope": "Unrecognized options: --nope",
     "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
+    "render s.ply -o -": "error: -: is no file: nothing is read from stdin or written to stdout; name a file",
+    "info -": "error: -: is no file",
     "render s.ply -o": "Missing value for argument '-o/--output'",
     "render s.ply t.ply -o x": "Unrecognized words: t.ply",
     "render s.ply -o x --json=3": "Unrecognized words: 3; see",
@@ -123,6 +126,19 @@ REFUSED = {
     "guide strat": "view, viewers; did you mean start?",
     "--colour": "Unrecognized options: --colour",
 }
+
+
+def test_a_path_may_begin_at_home(monkeypatch, tmp_path):
+    """A shell replaces ~ at the beginning of a word alone, so not in --output=~/out."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    words = "render ~/s.ply --output=~/out --cameras=~/c --path=~/p.json"
+    given = VERBS["render"].parse(words.split()[1:])
+    assert [getattr(given, name) for name in ("scene", "output", "cameras", "path")] == [
+        tmp_path / name for name in ("s.ply", "out", "c", "p.json")
+    ]
+    (tmp_path / "b.toml").write_text('[[scene]]\nscene = "~/s.ply"\nlpips = ["~/a", "b"]')
+    _, scenes = read_batch(tmp_path / "b.toml")
+    assert scenes["s"] == {"scene": str(tmp_path / "s.ply"), "lpips": [str(tmp_path / "a"), str(tmp_path / "b")]}
 
 
 def test_no_option_takes_an_empty_word():

@@ -4,6 +4,7 @@ Keys at the top hold for every scene; a [[scene]] table names one scene and may 
 `aaplug evaluate`; this module does not know them.  It reads the tables and resolves relative paths against the file.
 """
 
+import os
 import tomllib
 from collections.abc import Mapping
 from os import PathLike
@@ -55,4 +56,4 @@ def _settings(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def _resolved(value: Any, folder: Path) -> Any:
     if isinstance(value, list):
         return [_resolved(item, folder) for item in value]
-    return str(folder / value) if isinstance(value, str) else value
+    return str(folder / os.path.expanduser(value)) if isinstance(value, str) else value

@@ -20,6 +20,7 @@ from aaplug.core.conventions import (
     SpzVersion,
 )
 from aaplug.core.rules import RULES_3DGS
+from aaplug.system.errors import listing
 from aaplug.system.registry import Registry, named
 
 if TYPE_CHECKING:
@@ -103,8 +104,11 @@ class Viewer:
             alike = [v for v in others if suffix != "spz" or v.spz("auto") == self.spz("auto")]
             if alike:
                 return f"open {file} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
-            hint = f"; --for {others[0].name} writes one that {others[0].program} opens" if others else ""
-            return f"no viewer of this rule is known to open {file}{hint}"
+            fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
+            hint = f"--for {listing(fitting)} writes one for its own rule"
+            if others:
+                hint = f"--for {others[0].name} writes one that {others[0].program} opens"
+            return f"no viewer of this rule is known to open {file}; {hint}"
         nothing, _, why = self.settings.partition(": ")
         if nothing in ("nothing", "none"):
             return f"in {self.program}, there is nothing to choose" + (f": {why}" if why else "")

@@ -2,12 +2,14 @@
 
 import ast
 import inspect
+import os
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from aaplug.system.contracts import check_fields
@@ -124,6 +126,16 @@ class Text(Argument):
 def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:
     """An option that takes any word."""
     return Argument(metavar=metavar, flags=flags, read=read, **how)
+
+
+def as_path(word: str) -> Path:
+    """The path that a word names; ~ is the user's home, which shells leave to the program in `--output=~/a.ply`.
+
+    Raises UsageError for "-", which other programs take for their standard input or output.
+    """
+    if word == "-":
+        raise UsageError(word, "is no file: nothing is read from stdin or written to stdout; name a file")
+    return Path(os.path.expanduser(word))
 
 
 def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Names:

@@ -2,13 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal
 
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.io import MOST_FPS, StreamName
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, Text, flag, names, number
+from aaplug.options.base import (
+    DRAWING,
+    FILES,
+    FILM,
+    PYTHON_ONLY,
+    REPORT,
+    TUNING,
+    Options,
+    Text,
+    as_path,
+    flag,
+    names,
+    number,
+)
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -63,7 +75,7 @@ class WritingOptions(Options):
 class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering."""
 
-    path: Annotated[AnyPath | None, flag("FILE")] = None
+    path: Annotated[AnyPath | None, flag("FILE", read=as_path)] = None
     """Instead of --views: cameras of a path file, which `aaplug guide film-camera` lists."""
     camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
     """For one view: the view that the camera reaches while the shutter is open."""
@@ -82,7 +94,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
 
     scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size, or to that of a path file (default: 1)."""
-    path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE")] = "zoom"
+    path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE", read=as_path)] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or a path file as of render."""
     beside: Annotated[str | Recipe | None, names("none", kind="recipe", metavar=f"none|{RECIPE_METAVAR}")] = "classic"
     """Recipe to show on the left of a video; none shows --recipe alone, as a frame sequence always does."""
@@ -128,7 +140,7 @@ class EvaluateOptions(RecipeOptions):
     """Refine the poses of the views on their photographs first: errors that vanish were errors of the cameras."""
     metric: Annotated[str | Sequence[str] | None, METRICS] = None
     """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
-    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2), REPORT] = None
+    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2, read=as_path), REPORT] = None
     """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
     report: bool = False
     """Write report.html, one page with pictures side by side, tables and curves, and its plots."""
@@ -235,7 +247,7 @@ class LodOptions(WritingOptions, ViewOptions):
     """Tune each file for spark, playcanvas or another of `aaplug guide viewers`, instead of for aaplug."""
     to: Annotated[StreamName | None, names("sog", "3dtiles", "rad")] = None
     """With levels: stream them by sog (PlayCanvas), 3dtiles (CesiumJS) or rad (Spark), tuned for that viewer's rule."""
-    page: Annotated[AnyPath | None, flag("NODE_MODULES", read=Path)] = None
+    page: Annotated[AnyPath | None, flag("NODE_MODULES", read=as_path)] = None
     """With --to: add a page that opens the result, and the viewer's program from this folder of npm packages."""
     refine: bool = True
     """Merge alone, without the tuning, which takes minutes."""

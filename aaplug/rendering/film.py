@@ -9,7 +9,7 @@ from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
 from aaplug.core.lenses import PINHOLE
 from aaplug.options.shared import DEFAULT_SENSOR, FilmOptions
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 
 SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6
 
@@ -44,7 +44,8 @@ def filmed(
             raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
     if camera_to:
         if path or not len(views) == len(camera_to) == 1:
-            raise UsageError("camera_to", "names one view, for one view that is not of a path")
+            got = f"got {counted(len(camera_to), 'view')} for {counted(len(views), 'view')}"
+            raise UsageError("camera_to", f"names one view, for one of `views` that is not of a path; {got}")
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
