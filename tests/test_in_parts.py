@@ -53,7 +53,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
     together, whole = (read_scene(tmp_path / name).gaussians() for name in ("parts.ply", "whole.ply"))
     for field in ("means", "log_scales", "logit_opacities", "sh"):  # products of matrices round by their size
         torch.testing.assert_close(getattr(together, field), getattr(whole, field), rtol=1e-5, atol=1e-6)
-    assert told[-1] == (150, 150)
+    assert (told[0], told[-1]) == ((0, 150), (150, 150))  # a rate counts from the first
 
 
 def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
@@ -109,8 +109,9 @@ def test_a_survey_counts_what_cannot_be_used(tmp_path: Path):
     data = bytearray(path.read_bytes())
     data[-4:] = b"\xff\xff\xff\x7f"  # the last row's last number
     path.write_bytes(data)
-    found = survey(read_scene(path))
-    assert (found.count, found.faults) == (19, {"NaN in rot_3": 1})
+    told = []
+    found = survey(read_scene(path), tell=lambda *x: told.append(x))
+    assert (found.count, found.faults, told) == (19, {"NaN in rot_3": 1}, [(0, 20), (19, 20)])
 
 
 def test_a_histogram_has_the_quantiles_of_its_values():

@@ -72,6 +72,7 @@ class Survey:
 def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
     """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
     found = Survey()
+    tell(0, opened.count)  # parts differ in size, so the rate counts from here
     for part in opened.parts(faults=found.faults):
         found.filtered |= part.filter_3d is not None
         if not len(part):

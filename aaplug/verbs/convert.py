@@ -184,6 +184,7 @@ def convert_parts(
         return fuse(part, TrainingViews(part.convention, cameras, bounds), form)
 
     done = 0
+    tell(0, scene.count)  # parts differ in size, so the rate counts from here
     for part in Threads(threads).map(converted, scene.parts(size)):
         yield part
         done += len(part)
