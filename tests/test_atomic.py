@@ -10,11 +10,15 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import torch
 
 from aaplug.io.atomic import check_output, claimed, output_folder, replacing, writing
+from aaplug.io.image_formats import Storage
+from aaplug.io.layers import write_layers
+from aaplug.io.scenes import write_scene
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
-from tests.conftest import exit_code
+from tests.conftest import exit_code, make_scene
 
 OLD, NEW = b"old", b"new and longer"
 
@@ -65,6 +69,23 @@ def test_a_full_disk_is_one_line(output: Path, call: str, monkeypatch: pytest.Mo
     with pytest.raises(OutputError, match=r"scene\.ply: cannot be written: no space left"):
         write(output, NEW, overwrite=True)
     assert only_the_old_file_is_there(output)
+
+
+@pytest.mark.parametrize(
+    ("package", "name"), [("pxr", "a.usda"), ("pxr", "a.usdc"), ("pxr", "a.usdz"), ("OpenEXR", "a.exr")]
+)
+def test_a_full_disk_that_a_library_meets_is_one_line(tmp_path: Path, package: str, name: str):
+    pytest.importorskip(package)
+    image = {"rgb": torch.rand(100, 100, 3)}
+    how = (write_scene, make_scene(200)) if package == "pxr" else (write_layers, image, Storage.of(Path(name)))
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, usual[1]))
+    try:
+        with pytest.raises(OutputError, match=rf"{name}: cannot be written: file too large$"):
+            how[0](tmp_path / name, *how[1:])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_permissions_follow_the_umask_and_a_link_stays_a_link(output: Path, tmp_path: Path):

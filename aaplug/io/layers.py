@@ -20,6 +20,7 @@ from aaplug.io.atomic import AnyPath, replacing, replacing_file, write_file
 from aaplug.io.image_formats import COLOURS, Storage
 from aaplug.io.images import encoded
 from aaplug.system.contracts import contract
+from aaplug.system.errors import of_system
 
 INTEROP_IDS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_scene"}  # of the Color Interop Forum
 MAX_HALF = 65504.0  # the largest finite half
@@ -83,5 +84,5 @@ def _write_exr(
         try:
             with OpenEXR.File(header, channels) as file:
                 file.write(str(temporary))
-        except RuntimeError as error:  # such as a full disk
-            raise OSError(errno.EIO, str(error)) from error
+        except RuntimeError as error:
+            raise of_system(error) or OSError(errno.EIO, str(error)) from error

@@ -5,6 +5,8 @@ Everything here reaches the terminal as one line and ends the program with exit 
 """
 
 import difflib
+import errno
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -16,6 +18,7 @@ MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)  # what a full disk is, or a limit on files
 GONE = {  # options, verbs and functions of version 0.2, in CHANGELOG.md too; each with what takes its place
     "densify_every": "`method` mipmap-gs",
     "drop_bad": "read_scene(path, drop_bad=True)",
@@ -133,8 +136,10 @@ def top_package(frame: FrameType) -> str:
 
 
 def of_system(error: BaseException | None) -> OSError | None:
-    """The system's error, also behind torch's own about a full disk."""
+    """The system's error, also behind or in the words of a library's own about a full disk."""
     if isinstance(error, RuntimeError):
+        if said := next((number for number in FULL if os.strerror(number) in str(error)), None):
+            return OSError(said, os.strerror(said))
         error = error.__context__
     return error if isinstance(error, OSError) else None
 
