@@ -103,6 +103,7 @@ REFUSED = {
     f"{RENDER} --recipe multi-scale": ["base_mask"],
     f"{RENDER} --lens-angle 90": ["--lens-angle: belongs to lenses fisheye and equisolid; name one as --lens"],
     f"{RENDER} --normal-axes world": ["--normal-axes: are of the pass normal"],
+    f"{RENDER} --passes id --format exr --colour srgb": ["--colour: is of the pass rgb, which --passes leaves out"],
     f"{RENDER} --views r_0 --camera-to r_9": ["--camera-to: there is no view 'r_9'"],
     f"{RENDER} --views r_0 --samples 4": ["--samples: are of an aperture or a shutter; give --f-stop or --camera-to"],
     "render --cameras . -o new": ["error: SCENE: name one scene"],

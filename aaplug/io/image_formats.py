@@ -68,7 +68,7 @@ class Storage:
 
         Raises:
             UsageError: the format cannot hold a pass, that many bits or such colours, is not that of the output, or its
-                package is not installed.
+                package is not installed; or a choice is of a pass that is left out.
         """
         by_name = next((f.name for f in IMAGE_FORMATS.values() if output.suffix.lower() in f.suffixes), None)
         if format is not None and by_name not in (format, None):
@@ -79,6 +79,8 @@ class Storage:
         asked = tuple(dict.fromkeys([*passes, *["alpha"] * transparent]))
         if normal_axes != "camera" and "normal" not in asked:
             raise UsageError("normal_axes", "are of the pass normal, which `passes` leaves out")
+        if colour is not None and "rgb" not in asked:
+            raise UsageError("colour", "is of the pass rgb, which `passes` leaves out")
         for name in asked:
             if name not in chosen.passes:
                 holders = listing([f".{each.name}" for each in IMAGE_FORMATS.values() if name in each.passes])
