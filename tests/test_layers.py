@@ -54,7 +54,7 @@ def test_a_jpg_comes_close_and_alpha_alone_is_gray(tmp_path):
     ramp = torch.linspace(0, 1, 64).expand(48, 64)
     write_layers(tmp_path / "a.jpg", {"rgb": torch.stack([ramp, ramp, 1 - ramp], dim=2)}, storage("jpg"))
     assert (read_image(tmp_path / "a.jpg")[..., 0] - ramp).abs().max() < 0.02
-    write_layers(tmp_path / "a.png", {"alpha": ramp}, storage("png", "alpha"))
+    write_layers(tmp_path / "a.png", {"alpha": ramp}, storage("png", "alpha", colour=None))
     assert cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED).shape == (48, 64)
 
 
