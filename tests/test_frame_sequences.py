@@ -52,8 +52,8 @@ def test_frames_of_another_request_are_not_continued(cli):
     cli.done(words)
     before = bytes_of("out")
     changes = {
-        "--transparent": "files", "--scale 0.25": "size, views", "--recipe classic": "recipe",
-        "--fps 31": "fps",
+        "--transparent": "passes", "--bit-depth 16": "--bit-depth", "--scale 0.25": "size, views",
+        "--recipe classic": "recipe", "--fps 31": "fps",
     }  # fmt: skip
     for change, said in changes.items():
         cli.refused(

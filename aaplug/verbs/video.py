@@ -156,7 +156,8 @@ def _request(
         "rasterizer": renderer.rasterizer.name,
         "background": renderer.background,
         "cull_margin": str(renderer.training.cull_margin),
-        "files": [storage.format.name, *storage.passes, storage.bit_depth, storage.colour, storage.normal_axes],
+        **vars(storage),
+        "format": storage.format.name,
     }
 
 
