@@ -119,7 +119,7 @@ class RecipeOptions(ViewOptions):
     quality: Annotated[str, names(*QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, names(*get_args(RateReference)), DRAWING] = None
-    """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
+    """Sampling rate that matched and auto compare with (default: pose: global, interval for free cameras)."""
     order: Annotated[SplatOrder, DRAWING] = "depth"
     """Order of splats: by depth of their centres, or per tile, by depth along its ray, so that colours pop less."""
     scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT"), DRAWING] = None

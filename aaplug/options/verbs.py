@@ -76,7 +76,7 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering."""
 
     path: Annotated[AnyPath | None, flag("FILE", read=as_path)] = None
-    """Instead of --views: cameras of a path file, which `aaplug guide film-camera` lists."""
+    """Instead of --views: the cameras of a path file; `aaplug guide film-camera` lists the kinds."""
     camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
     """For one view: the view that the camera reaches while the shutter is open."""
 
@@ -101,7 +101,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
     end: Annotated[float, SCALE] = 0.125
-    """Sampling rate where it turns back."""
+    """Sampling rate, relative to training, where a zoom or dolly turns back."""
     seconds: Annotated[float, number(0.01, 3600)] = 6.0
     """Length in seconds of a zoom, dolly or orbit."""
     fps: Annotated[float | None, number(0.1, MOST_FPS)] = None
@@ -137,7 +137,7 @@ class EvaluateOptions(RecipeOptions):
     truth: Source = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
     poses: Annotated[bool, REPORT] = False
-    """Refine the poses of the views on their photographs first: errors that vanish were errors of the cameras."""
+    """Refine the poses of the views on their photographs first: what PSNR gains was the cameras' error."""
     metric: Annotated[str | Sequence[str] | None, METRICS] = None
     """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
     lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2, read=as_path), REPORT] = None
@@ -231,7 +231,7 @@ class LodOptions(WritingOptions, ViewOptions):
     """How light, and how to tune."""
 
     views: Annotated[str, VIEWS] = "train"
-    """Views to tune levels on and to find hidden Gaussians by, with free ones between them."""
+    """Views, with free cameras between them, that levels are tuned on and that tell which Gaussians are hidden."""
 
     simplify: Annotated[float | None, number(1e-6, 1e9, metavar="SHARE|COUNT")] = None
     """Write one scene with this share of the Gaussians or, above 1, this number of them."""
@@ -309,7 +309,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     loss: Annotated[str, names(kind="loss"), TUNING] = "l2"
     """l2, or for comparison 3DGS's 0.8 L1 + 0.2 D-SSIM."""
     anchor: Annotated[float, number(0, 1_000_000, metavar="WEIGHT"), TUNING] = ANCHOR_WEIGHT
-    """Weight of the training size in every step, against 1 for the other scales."""
+    """Weight of the training size in every step, against 2 for 1/4 and 1 for other scales."""
     move: Annotated[Sequence[str], names(*TUNED_PARAMETERS, count=None), TUNING] = TUNED_PARAMETERS
     """Parameters that move."""
     learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
