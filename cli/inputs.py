@@ -41,7 +41,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, flag("[SCENE]", read=as_path, by_place=True)] = None
-    """A scene file (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels or frames."""
+    """A scene file (`aaplug guide formats`) or folder: model, levels; for render, video, evaluate, convert: frames."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=as_path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None

@@ -142,9 +142,9 @@ def lod(words: Words) -> Answer:
 def finetune(words: Words) -> Answer:
     """Optimize the Gaussians until every scale looks like the training size, averaged down; write a plain scene file.
 
-    It takes minutes to hours and gives the closest images at one sample per pixel; convert takes seconds.  A report
-    (.finetune.json), pictures (.finetune.png) and a checkpoint go beside it.  Ctrl-C stops after the current step;
-    --resume continues.
+    It takes minutes to hours and gives the closest images at one sample per pixel; convert takes seconds to minutes.
+    A report (.finetune.json), pictures (.finetune.png) and a checkpoint go beside the file.  Ctrl-C stops after the
+    current step; --resume continues.
     """
     inputs = read_inputs(words)
     tuned = aaplug.finetune(*inputs, words.output, **told(words, verbs.FinetuneOptions))

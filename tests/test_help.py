@@ -10,6 +10,7 @@ import pytest
 from aaplug_cli.verbs import VERBS
 
 from aaplug.methods import RECIPES
+from aaplug.options.verbs import IN_TIME, LOSS_WEIGHTS
 from aaplug.system.registry import names_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +37,14 @@ def test_an_option_is_told_in_one_line():
     texts = [text for file in FILES for text in helps(file)]
     assert len(texts) > 60
     assert [text for text in texts if "\n" in text] == []
+
+
+def test_help_states_which_verbs_take_frames_and_what_the_anchor_weighs_against():
+    scene = next(text for text in helps(ROOT / "cli" / "inputs.py") if text.startswith("A scene file"))
+    folders = set(re.findall(r"[a-z]+", scene.split(" folder: ")[1]))
+    assert folders & set(VERBS) == {options.__name__.removesuffix("Options").lower() for options in IN_TIME}
+    anchor = next(text for text in helps(ROOT / "aaplug" / "options" / "verbs.py") if text.startswith("Weight of the"))
+    assert f"against {LOSS_WEIGHTS[1 / 4]:g} for 1/4 and {LOSS_WEIGHTS[1 / 2]:g} for" in anchor
 
 
 def test_help_begins_with_examples_and_lists_each_verb_with_its_first_line_only(cli):
