@@ -365,7 +365,7 @@ def test_checkpoints_of_others_are_refused(tmp_path):
     said = "another version: expected aaplug finetune 8, got aaplug finetune 1; start again with `overwrite`"
     with pytest.raises(FormatError, match=said):
         load(tmp_path / "old.pt", job)
-    with pytest.raises(UsageError, match="its steps was 6, now it is 13"):
+    with pytest.raises(UsageError, match="steps changed from 6 to 13; repeat that run, or start again with"):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))
 
 
@@ -406,7 +406,7 @@ def test_a_checkpoint_is_of_its_photographs(tmp_path):
     job = replace(job, views=views, truth=replace(job.truth, source="photographs"))
     save(path, job, begin(job))
     write_png(photo, torch.ones(*VIEWS[0].hw, 3), overwrite=True)
-    with pytest.raises(UsageError, match="its photographs was"):
+    with pytest.raises(UsageError, match="photographs changed from"):
         load(path, replace(job))
 
 

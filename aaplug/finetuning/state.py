@@ -34,6 +34,7 @@ from aaplug.system.locks import scratch
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
 FORMAT, VERSION = "aaplug finetune", 8  # of a checkpoint
+ANEW = "start again with `overwrite`, not `resume`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,12 +181,11 @@ def load(path: Path, job: TuningJob) -> State:
         version, expected = f"{content['format']} {content.get('version', '')}".strip(), f"{FORMAT} {VERSION}"
         if version != expected:
             problem = f"is a checkpoint of another version: expected {expected}, got {printable(version)}"
-            problem += "; start again with `overwrite`, not `resume`"
-            raise FormatError(path, problem)
+            raise FormatError(path, f"{problem}; {ANEW}")
         for key, value in job.facts.items():
             if (before := content["job"].get(key)) != value:
-                problem = f"is of another run: its {key} was {printable(str(before))}, now it is {value}"
-                raise UsageError(str(path), problem)
+                problem = f"is of another run: {key} changed from {printable(str(before))} to {value}"
+                raise UsageError(str(path), f"{problem}; repeat that run, or {ANEW}")
         return state_of(content["state"], job, content["good"])
     except AaplugError:
         raise
