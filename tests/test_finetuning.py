@@ -394,7 +394,7 @@ CHANGES = {
 def test_a_checkpoint_is_of_all_that_the_result_depends_on(tmp_path, key):
     job, path = make_job(), tmp_path / "run.pt"
     save(path, job, begin(job))
-    with pytest.raises(UsageError, match=f"its {key} was"):
+    with pytest.raises(UsageError, match=f"another run: {key} changed from"):
         load(path, CHANGES[key](job))
 
 
