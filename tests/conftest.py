@@ -3,6 +3,7 @@
 `shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
 """
 
+import contextlib
 import json
 import logging
 import math
@@ -48,6 +49,7 @@ on_demand.PATIENCE_SECONDS = 1e9  # tests compile nothing beside their work
 ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
 
 ROOT = Path(__file__).resolve().parents[1]
+GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
 SHARED_DATA = ROOT.parent / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
 CLEAR_REFS = Path("/proc/self/clear_refs")
@@ -139,6 +141,10 @@ class Program:
         assert code == 0, err
         return out, err
 
+    def facts(self, words: str) -> dict[str, Any]:
+        """What a run prints with `--json` that succeeds."""
+        return json.loads(self.done(f"{words} --json")[0])
+
     def refused(self, words: str, *said: str) -> str:
         """The line in which a run is refused, which says that; no file is written or changed."""
         before = times_of_files()
@@ -157,11 +163,25 @@ def times_of_files() -> dict[Path, int | None]:
 
 
 @pytest.fixture
-def cli(dataset, tmp_path, monkeypatch, capsys) -> Program:
-    """The program in a fresh folder holding a copy of the data set."""
-    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
+def program(tmp_path, monkeypatch, capsys) -> Program:
+    """The program in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return Program(capsys)
+
+
+@pytest.fixture
+def cli(dataset, program) -> Program:
+    """The program in a fresh folder holding a copy of the data set."""
+    shutil.copytree(dataset, Path(), dirs_exist_ok=True)
+    return program
+
+
+def made_by(words: str, dataset: Path, folder: Path) -> Path:
+    """The folder, with a copy of the data set and what a run of the program made in it."""
+    shutil.copytree(dataset, folder, dirs_exist_ok=True)
+    with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
+        main(words.split())
+    return folder
 
 
 _drawn: dict[str, bytes] = {}
@@ -180,6 +200,18 @@ def plots_drawn_once(monkeypatch) -> None:
         return _drawn[kind]
 
     monkeypatch.setattr(Plot, "_saved", saved)
+
+
+def with_photographs(
+    look: Renderer, views: Iterable[Camera], folder: Path, gain: float = 1.0, lift: float = 0.0
+) -> CameraSet:
+    """The views, as training and as test views, each with a photograph: what the look shows of it, changed a little."""
+    found = []
+    for number, view in enumerate(views):
+        photo = folder / f"photo_{number}.png"
+        write_png(photo, (look(view).rgb * gain + lift).clamp(0, 1))
+        found.append(replace(view, photo=photo))
+    return CameraSet(tuple(found), tuple(found))
 
 
 def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, float]]) -> None:
@@ -276,6 +308,20 @@ def memory_taken(prepare: str, *works: str, warm: str = "pass") -> list[int]:
     which differs between builds of torch, but for what the statement `warm` ran before.
     """
     return [*map(int, run_python(MEASURE.format(prepare=prepare, works=works, warm=warm)).stdout.split())]
+
+
+@pytest.fixture(scope="session")
+def cameras() -> list[Camera]:
+    """Views from all around, near and far."""
+    eyes = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
+    return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(eyes)]
+
+
+def moved(camera: Camera, offset: Iterable[float]) -> Camera:
+    """The camera moved by an offset in the world."""
+    pose = camera.cam_from_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ torch.tensor([*offset], dtype=pose.dtype)
+    return replace(camera, cam_from_world=pose)
 
 
 def straight_camera(

@@ -4,10 +4,11 @@ import gzip
 import json
 import shutil
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,15 @@ def write_json(path: Path, document: object) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document))
     return path
+
+
+def with_value(document: Any, place: Sequence[str | int], value: object) -> Any:
+    """A copy of a document of JSON with another value at a place, which is told by keys and indices."""
+    changed = part = json.loads(json.dumps(document))
+    for key in place[:-1]:
+        part = part[key]
+    part[place[-1]] = value
+    return changed
 
 
 def oracle() -> Gaussians:

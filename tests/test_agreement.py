@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from aaplug_cli.main import main
 
 import aaplug
 from aaplug.core.cameras import CameraSet
@@ -136,12 +135,11 @@ def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sampl
     assert chosen.other is None
 
 
-def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp_path, capsys):
-    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
+def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, program):
+    write_scene("a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
     for axes, provisional in (("auto", True), ("opencv", False)):
-        with pytest.raises(SystemExit):
-            main(["info", str(tmp_path / "a.spz"), "--spz-axes", axes])
-        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("scene: ") and "axes" in line]
+        _, err = program.done(f"info a.spz --spz-axes {axes}")
+        told = [line for line in err.splitlines() if line.startswith("scene: ") and "axes" in line]
         assert [line.startswith("scene: unless the cameras tell otherwise, ") for line in told] == [provisional]
 
 

@@ -1,12 +1,10 @@
 """The benchmark: figures that are measured, scenes that are what they say."""
 
-import json
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from aaplug_cli.main import main
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.kernels import EAGER
@@ -67,23 +65,19 @@ def test_the_exponent_of_a_power_is_found(power):
     assert exponent(sizes, [3 * size**power for size in sizes]) == pytest.approx(power)
 
 
-def run_bench(capsys, *words: str):
-    with pytest.raises(SystemExit) as end:
-        main(["bench", "--rasterizer", "eager", "--repeats", "1", "--resolution", "40x24", *words])
-    return end.value.code, capsys.readouterr()
+BENCH = "bench --rasterizer eager --repeats 1 --resolution 40x24"
 
 
-def test_one_run_is_one_object_also_on_windows(capsys, monkeypatch):
+def test_one_run_is_one_object_also_on_windows(program, monkeypatch):
     monkeypatch.setitem(sys.modules, "resource", None)
-    code, said = run_bench(capsys, "--gaussians", "300", "--json")
-    figures = json.loads(said.out)
-    assert (code, figures["peak_bytes"]) == (0, None)
+    figures = program.facts(f"{BENCH} --gaussians 300")
+    assert figures["peak_bytes"] is None
     names = "rasterizer forward_ms forward_backward_ms evaluations ns_per_evaluation stages_ms peak_bytes"
     assert set(names.split()) <= set(figures)
     assert figures["gaussians"] == 300
 
 
-def test_several_runs_are_a_table_with_exponents_that_breaks_no_word_at_80_columns(capsys, monkeypatch):
+def test_several_runs_are_a_table_with_exponents_that_breaks_no_word_at_80_columns(program, monkeypatch):
     stages = {"cut": 123.0} | dict.fromkeys(STAGES, 123.0) | {"composite": 123_456.0}
     rest = 12345.0, 45678.0, 10**8, 12.34, stages, 10**11, {"operators": 1234}, 1.0
 
@@ -91,17 +85,14 @@ def test_several_runs_are_a_table_with_exponents_that_breaks_no_word_at_80_colum
         return Figures("compiled", 10_000 * len(drawn.scene), 1600, 1060, *rest)
 
     monkeypatch.setattr("aaplug.verbs.bench.measure", large)
-    said = run_bench(capsys, "--gaussians", "300", "600")[1].out
+    said, _ = program.done(f"{BENCH} --gaussians 300 600")
     assert "time grows as compiled: Gaussians^" in said
     assert "compiled: pixels" not in said
     assert {"3,000,000", "1600x1060", "compiled", *stages, "123456", "45678", "exp/eval", "ns/eval"} <= {*said.split()}
 
 
-def test_the_middle_scene_is_drawn_at_every_size(capsys):
-    words = ("--gaussians", "300", "400", "500", "--json")
-    code, said = run_bench(capsys, *words, "--resolution", "40x24", "48x32")
-    found = json.loads(said.out)
-    assert code == 0
+def test_the_middle_scene_is_drawn_at_every_size(program):
+    found = program.facts(f"{BENCH} 48x32 --gaussians 300 400 500")
     sizes = [(run["gaussians"], run["width"]) for run in found["runs"]]
     assert sizes == [(300, 40), (400, 40), (500, 40), (400, 48)]
     assert set(found["exponents"]) == {"eager: Gaussians", "eager: pixels"}

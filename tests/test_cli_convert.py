@@ -94,9 +94,7 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli, monkeypatch):
         return evaluate(task, **how)
 
     monkeypatch.setattr("aaplug.finetuning.fitting.evaluate", noted)
-    code, out, _ = cli(f"{CONVERT} --viewer mip --steps 0 --json")
-    found = json.loads(out)
-    assert code == 0
+    found = cli.facts(f"{CONVERT} --viewer mip --steps 0")
     assert [f["method"] for f in found["fused"]] == ["matched-energy"]
     residual = found["residual"]
     assert residual["_aaplug"]["truth"] == "self"
@@ -106,8 +104,7 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli, monkeypatch):
 
 
 def test_convert_for_the_rule_of_training_changes_no_byte(cli):
-    code, out, _ = cli(f"{CONVERT} --for classic --json")
-    assert (code, json.loads(out)["fused"]) == (0, [])
+    assert cli.facts(f"{CONVERT} --for classic")["fused"] == []
     assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
 
 

@@ -1,6 +1,5 @@
 """Fine-tuning from the command line: files, tags, interruptions."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -14,7 +13,7 @@ from aaplug_cli.main import main
 from aaplug.core.conventions import MIP
 from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
-from tests.conftest import exit_code
+from tests.conftest import exit_code, made_by
 
 TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
@@ -23,11 +22,7 @@ RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
 @pytest.fixture(scope="module")
 def whole(dataset, tmp_path_factory) -> Path:
     """A folder with the outputs of an uninterrupted run."""
-    folder = tmp_path_factory.mktemp("whole")
-    shutil.copytree(dataset, folder, dirs_exist_ok=True)
-    with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
-        main(RUN.split())
-    return folder
+    return made_by(RUN, dataset, tmp_path_factory.mktemp("whole"))
 
 
 def test_finetune_without_steps_changes_no_byte(cli):
@@ -51,9 +46,8 @@ def test_an_upsampler_is_for_scales_above_the_photographs(cli):
     for i in (1, 2):
         shutil.copy("train/r_0.png", f"train/r_{i}.png")
     words = "finetune scene.ply --cameras . -o tuned.ply --train-scale 0.5 --upsampler bicubic --steps 0 --scale"
-    code, _, err = cli(f"{words} 2")
-    assert (code, "--upsampler: is for scales above the source images', and there is none" in err) == (2, True)
-    assert cli(f"{words} 4")[0] == 0
+    cli.refused(f"{words} 2", "--upsampler: is for scales above the source images', and there is none")
+    cli.done(f"{words} 4")
 
 
 def test_finetune_writes_scene_report_and_pictures(whole):

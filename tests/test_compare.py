@@ -55,9 +55,8 @@ def shuffled(scene, seed=0):
 
 
 def test_a_scene_equals_itself_at_every_scale(cli):
-    code, out, _ = cli(f"compare scene.ply scene.ply {WORDS} --json --fail-under 200dB")
-    found = json.loads(out)
-    assert (code, found["guard"]["value"]) == (0, None)
+    found = cli.facts(f"compare scene.ply scene.ply {WORDS} --fail-under 200dB")
+    assert found["guard"]["value"] is None
     first, again = (found["scenes"][name] for name in ("scene.ply", "scene.ply_again"))
     assert again["differences"]["positions"] == {"rms": 0, "median": 0, "largest": 0}
     for scale in ("0.5", "1", "2"):
@@ -127,9 +126,9 @@ def test_the_truth_is_the_reference_at_that_size(cli):
 
 
 def test_a_viewer_draws_all_and_the_truth_stays(cli):
-    words = f"compare scene.ply scene.ply {WORDS} --metric psnr --json"
-    shown = json.loads(cli(f"{words} --for classic")[1])["scenes"]["scene.ply"]
-    found = json.loads(cli(f"{words} --for mip")[1])
+    words = f"compare scene.ply scene.ply {WORDS} --metric psnr"
+    shown = cli.facts(f"{words} --for classic")["scenes"]["scene.ply"]
+    found = cli.facts(f"{words} --for mip")
     (first, second), guard = found["scenes"].values(), found["guard"]
     assert shown["scales"]["1"]["PSNR"] is None  # as training did
     assert shown["scales"]["0.5"]["PSNR"]["mean"] < 60
@@ -141,9 +140,8 @@ def test_a_viewer_draws_all_and_the_truth_stays(cli):
 
 def test_another_reference_and_levels_of_detail(cli):
     cli.done("lod scene.ply --cameras . -o levels --levels 1 --no-refine --rasterizer eager")
-    code, out, _ = cli(f"compare levels scene.ply --reference scene.ply {QUICK} --json")
-    found = json.loads(out)
-    assert (code, found["reference"]) == (0, "scene.ply")
+    found = cli.facts(f"compare levels scene.ply --reference scene.ply {QUICK}")
+    assert found["reference"] == "scene.ply"
     assert list(found["scenes"]) == ["scene.ply", "levels"]
     assert found["scenes"]["levels"]["format"] == "levels"
     assert found["scenes"]["levels"]["bytes"] == sum(file.stat().st_size for file in Path("levels").iterdir())
@@ -256,7 +254,7 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     _, worst = min((views[name]["PSNR"], name) for views in per_view for name in views)
     captions = [f"{views[worst]['PSNR']:.2f} dB" for views in reversed(per_view)]
     assert [text for text in texts if "dB" in text] == captions
-    assert json.loads(cli(f"{words} --overwrite --json")[1])["guard"] == data["guard"]
+    assert cli.facts(f"{words} --overwrite")["guard"] == data["guard"]
     with Path("out/compare.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 3 * 3 * 3  # scenes, scales, views

@@ -32,7 +32,7 @@ from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE
-from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file
+from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file, write_json
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(
@@ -373,8 +373,7 @@ def sog_folder(folder: Path, **changes: object) -> Path:
     for file in (DATA / "oracle_sog").iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     meta = json.loads((folder / "meta.json").read_text()) | changes
-    (folder / "meta.json").write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
-    return folder / "meta.json"
+    return write_json(folder / "meta.json", {k: v for k, v in meta.items() if v is not None})
 
 
 def test_version_1_of_sog(tmp_path: Path, expected):
@@ -387,8 +386,7 @@ def test_version_1_of_sog(tmp_path: Path, expected):
         "quats": meta["quats"],
         "shN": {"mins": -2.0, "maxs": 2.0, "files": meta["shN"]["files"]},
     }
-    path = sog_folder(tmp_path)
-    path.write_text(json.dumps(first))
+    path = write_json(sog_folder(tmp_path), first)
     scene, second = read_scene(path).gaussians(), read_scene(DATA / "oracle_sog" / "meta.json").gaussians()
     assert torch.equal(scene.means, second.means)
     assert scene.sh_degree == 3

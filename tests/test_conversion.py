@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import CameraSet
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.projection import project
 from aaplug.core.rules import Rules
@@ -22,13 +22,6 @@ from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
-
-EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> list[Camera]:
-    return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(EYES)]
 
 
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS.keys())

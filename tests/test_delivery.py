@@ -19,7 +19,7 @@ from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.codebooks import codebook, nearest_row, nearest_value, palette
 from aaplug.io.scenes.packed import half_turn_about_z
 from aaplug.system.errors import FormatError, UsageError
-from tests.scene_files import oracle
+from tests.scene_files import oracle, with_value, write_json
 
 SPLATS = "KHR_gaussian_splatting"
 
@@ -32,8 +32,7 @@ def document(folder: Path) -> dict:
 
 
 def written(folder: Path, content: dict) -> Path:
-    (folder / "b.gltf").write_text(json.dumps(content))
-    return folder / "b.gltf"
+    return write_json(folder / "b.gltf", content)
 
 
 def test_nodes_place_primitives_and_all_are_one_scene(tmp_path: Path):
@@ -106,13 +105,8 @@ WRONG = {
 @pytest.mark.parametrize("what", WRONG)
 def test_what_cannot_be_read_right_is_refused(tmp_path: Path, what: str):
     place, value, problem = WRONG[what]
-    content = document(tmp_path)
-    target = content
-    for key in place[:-1]:
-        target = target[key]
-    target[place[-1]] = value
     with pytest.raises(FormatError, match=problem):
-        read_scene(written(tmp_path, content)).gaussians()
+        read_scene(written(tmp_path, with_value(document(tmp_path), place, value))).gaussians()
 
 
 def test_a_gltf_is_replaced_with_its_buffer(tmp_path: Path):

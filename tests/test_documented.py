@@ -22,9 +22,8 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.options.verbs import BUILT_IN_PATHS
-from tests.conftest import ROOT, SAMPLE, write_model
+from tests.conftest import GUIDES, ROOT, SAMPLE, write_model
 
-GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GAUSSIANS = 80
 SIZE = 24  # px: side of the photographs

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -30,26 +29,23 @@ from aaplug.evaluation.results import (
     tables,
 )
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, ViewTruth, back_projected
-from aaplug.io.images import read_image, write_png
+from aaplug.io.images import read_image
 from aaplug.methods import RECIPES
 from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FormatError, UsageError
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, with_photographs
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     """The scene's own look, and two views whose photographs are slightly brightened renders."""
-    folder: Path = tmp_path_factory.mktemp("photos")
     views = [make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b")]
     scene = make_scene(150)
     look = own_look(scene, TrainingViews.of(scene, views), "eager")
-    for i, view in enumerate(views):
-        write_png(folder / f"{view.name}.png", drawn(look, view) * 0.9 + 0.05)
-        views[i] = replace(view, photo=folder / f"{view.name}.png")
-    return look, views
+    recipe = replace(look, recipe=RECIPES["classic"])
+    return look, with_photographs(recipe, views, tmp_path_factory.mktemp("photos"), 0.9, 0.05).test
 
 
 @pytest.fixture

@@ -12,9 +12,8 @@ from aaplug_cli.verbs import VERBS
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import IN_TIME, LOSS_WEIGHTS
 from aaplug.system.registry import names_of
+from tests.conftest import GUIDES, ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
-GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
 FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
 
 

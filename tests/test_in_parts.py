@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.survey import Histogram, check_frame_of, survey
@@ -16,14 +15,9 @@ from aaplug.methods.conversion import FORMS, fuse
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
 from aaplug.verbs.convert import convert_parts
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_scene
 
 SIZE = 37  # Gaussians a part, so that the last one is not full
-
-
-@pytest.fixture
-def cameras() -> list[Camera]:
-    return [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5))]
 
 
 def saved(folder: Path, scene: Gaussians) -> Path:

@@ -1,6 +1,5 @@
 """Levels of detail: what merging keeps, what it does not depend on, and the files and errors of `aaplug lod`."""
 
-import json
 import math
 from dataclasses import replace
 from itertools import product
@@ -272,8 +271,8 @@ def test_areas_are_those_of_splats_seen_along_an_axis_from_far_away(place, eye):
 
 
 def test_one_lighter_scene(cli):
-    out, _ = cli.done("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 1 --json")
-    assert json.loads(out)["levels"] == [{"rate": pytest.approx(0.2**0.5), "gaussians": 30}]
+    facts = cli.facts("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 1")
+    assert facts["levels"] == [{"rate": pytest.approx(0.2**0.5), "gaussians": 30}]
     found = read_scene(Path("light.ply")).gaussians()
     assert (len(found), found.convention) == (30, CLASSIC)
     assert found.fused[0].settings == {"rate": "0.4472", "from": "150"}

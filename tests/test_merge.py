@@ -21,6 +21,7 @@ from aaplug.methods.conversion import carried
 from aaplug.rendering.agreement import photo_at
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError
+from tests.conftest import moved
 from tests.scene_files import oracle
 
 WHITE = (1.0, 1.0, 1.0)
@@ -56,15 +57,6 @@ def test_a_mirrored_scene_is_seen_mirrored(signs):
     assert all(torch.equal(getattr(again, name), getattr(scene, name)) for name in scene.columns)
 
 
-def moved_cameras(cameras, move):
-    def at(camera):
-        pose = camera.cam_from_world.clone()
-        pose[:3, 3] -= pose[:3, :3] @ torch.tensor(move, dtype=pose.dtype)
-        return replace(camera, cam_from_world=pose, photo=None)
-
-    return CameraSet(tuple(map(at, cameras.train)), tuple(map(at, cameras.test)))
-
-
 def test_a_mixed_scene_looks_like_its_parts(sample_scene, sample_cameras, sample_training):
     """A classic, a Mip-Splatting and an antialiased scene, merged, are within 0.5 dB of each drawn alone."""
     parts = [carried(sample_scene, sample_training, convention) for convention in (CLASSIC, MIP, ANTIALIASED)]
@@ -72,7 +64,9 @@ def test_a_mixed_scene_looks_like_its_parts(sample_scene, sample_cameras, sample
     merged = aaplug.merge(parts, sample_cameras, move=sum(moves, ()))
     assert (merged.convention, len(merged)) == (MIP, 3 * len(sample_scene))
     for part, move in zip(parts, moves, strict=True):
-        there = moved_cameras(sample_cameras, move)
+        there = CameraSet(
+            *(tuple(moved(v, move) for v in views) for views in (sample_cameras.train, sample_cameras.test))
+        )
         alone = own_look(part, TrainingViews.of(part, sample_cameras), background=WHITE)
         whole = own_look(merged, TrainingViews.of(merged, there), background=WHITE)
         view, same = (cameras.test[0].scaled(0.25) for cameras in (sample_cameras, there))

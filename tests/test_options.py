@@ -5,10 +5,10 @@ import io
 import math
 import re
 import sys
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
-from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
 
 from aaplug.io.batch_file import read_batch
@@ -157,23 +157,18 @@ def test_a_refusal_has_no_frame_on_a_terminal_without_unicode(monkeypatch):
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_a_refusal_is_one_line(words, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(words.split())
-    printed = capsys.readouterr()
-    assert stop.value.code == 2
-    assert printed.err.startswith("error: ")
-    assert printed.err.count("\n") == 1, printed.err
-    assert REFUSED[words] in printed.err
-    assert not [*tmp_path.iterdir()]
+def test_a_refusal_is_one_line(words, program):
+    code, _, err = program(words)
+    assert code == 2
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1, err
+    assert REFUSED[words] in err
+    assert not [*Path().iterdir()]
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_shows_every_range(verb, capsys):
-    with pytest.raises(SystemExit):
-        main([verb, "--help"])
-    shown = "".join(capsys.readouterr().out.split())
+def test_help_shows_every_range(verb, program):
+    shown = "".join(program(f"{verb} --help")[1].split())
     assert not re.search(r"default:(True|False|None|inf)\)", shown), "of a switch"
     for option in VERBS[verb].options.values():
         if isinstance(option.argument, Number):

@@ -1,6 +1,5 @@
 """Passes: each against a truth of its own, and by its rule where a pixel sees several things."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -95,16 +94,6 @@ def test_a_silhouette_takes_no_depth_from_behind_it():
     nothing = drawn["alpha"] == 0
     assert nothing.any()
     assert not any(drawn[name][nothing].any() for name in ("depth", "normal", "depth-nearest"))
-
-
-def test_alpha_is_one_minus_transmittance():
-    scene, camera = make_scene(300), make_camera((0.0, -4.0, 0.3), (64, 48))
-    drawn = [Renderer.of(scene, [camera], "classic", rasterizer=name) for name in ("eager", "reference")]
-    alpha, exact = (renderer.passes(camera, ["alpha"])["alpha"].double() for renderer in drawn)
-    assert (alpha - exact).abs().max() < 1e-5
-    assert 0.2 < exact.mean() < 0.8
-    behind = [replace(drawn[0], background=(level,) * 3)(camera).rgb.double() for level in (0.0, 1.0)]
-    assert (1 - (behind[1] - behind[0]).mean(dim=2) - alpha).abs().max() < 1e-5
 
 
 GROUPS = [("nearest", "median", "number", "weight"), ("count", "weight", "number", "median"), ("last",) * 4]
@@ -231,8 +220,8 @@ def test_a_misspelt_pass_is_refused_with_the_nearest_name(cli):
 
 def test_render_writes_passes(cli):
     names = "rgb,alpha,depth,normal,id"
-    out, _ = cli.done(f"render scene.ply --cameras . -o out --views train --format npz --passes {names} --json")
-    with np.load(json.loads(out)["images"][0]["file"]) as found:
+    facts = cli.facts(f"render scene.ply --cameras . -o out --views train --format npz --passes {names}")
+    with np.load(facts["images"][0]["file"]) as found:
         assert {*names.split(",")} < {*found.files}
         assert found["normal"].shape == (48, 64, 3)
         assert found["id"].dtype == np.int64

@@ -45,10 +45,9 @@ from aaplug.system.signals import _exit
 from aaplug.verbs.check_plugin import check_plugin
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.finetune import finetune
-from tests.conftest import SAMPLE
+from tests.conftest import ROOT, SAMPLE
 from tests.test_documented import GAUSSIANS, few, write_cameras
 
-ROOT = Path(__file__).resolve().parents[1]
 GUIDE = (ROOT / "examples" / "guides" / "contributing.md").read_text()
 PROGRAM = """
 import json, sys

@@ -13,7 +13,7 @@ from aaplug.evaluation.results import mean
 from aaplug.finetuning.poses import moved_by, refine_pose
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, with_photographs
 
 CHANGE = torch.tensor([0.006, -0.008, 0.005, 0.004, -0.005, 0.006], dtype=torch.float64)  # radians, shares of the depth
 DEPTH = 4.0
@@ -22,13 +22,9 @@ DEPTH = 4.0
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory):
     """A scene and two views with photographs, which the scene itself made."""
-    scene, folder = make_scene(200, seed=3), tmp_path_factory.mktemp("photographs")
-    views = []
-    for i, eye in enumerate([(0.5, -4.0, 0.4), (2.6, -3.0, 1.0)]):
-        view = make_camera(eye, size=(128, 96), name=f"view{i}")
-        write_png(folder / f"{i}.png", Renderer.of(scene, [view], min_seen=0.0)(view).rgb.clamp(0, 1))
-        views.append(replace(view, photo=folder / f"{i}.png"))
-    return scene, CameraSet(tuple(views), tuple(views))
+    scene, eyes = make_scene(200, seed=3), [(0.5, -4.0, 0.4), (2.6, -3.0, 1.0)]
+    views = [make_camera(eye, size=(128, 96), name=f"view{i}") for i, eye in enumerate(eyes)]
+    return scene, with_photographs(Renderer.of(scene, views, min_seen=0.0), views, tmp_path_factory.mktemp("photos"))
 
 
 def apart(a: Camera, b: Camera) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project, with_ray_slopes
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
-from tests.conftest import make_camera, make_scene, straight_camera
+from tests.conftest import make_camera, make_scene, moved, straight_camera
 
 F64 = torch.float64
 
@@ -72,14 +72,13 @@ def test_a_scene_far_from_the_origin_projects_as_if_it_were_near():
     offset = torch.tensor([2.0**22, -(2.0**22), 2.0**22], dtype=F64)
     scene, camera = make_scene(50, dtype=F64), make_camera((0.13, -4.07, 0.21))
     scene = replace(scene, means=scene.means.mul(2).round().div(2)).to(torch.float32)
-    pose = camera.cam_from_world.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset
     far = replace(scene, means=(scene.means.double() + offset).float())
     assert (far.means.double() - offset).equal(scene.means.double()), "halves are exact out there"
-    there, here = project(far, replace(camera, cam_from_world=pose)), project(scene, camera)
+    away = moved(camera, offset)
+    there, here = project(far, away), project(scene, camera)
     torch.testing.assert_close(there.means, here.means, rtol=1e-5, atol=1e-4)
     torch.testing.assert_close(there.covs, here.covs, rtol=1e-4, atol=1e-4)
-    shaded = shade(there, far, replace(camera, cam_from_world=pose)), shade(here, scene, camera)
+    shaded = shade(there, far, away), shade(here, scene, camera)
     torch.testing.assert_close(shaded[0].rgb, shaded[1].rgb, rtol=1e-5, atol=1e-5)
 
 

@@ -1,6 +1,5 @@
 """Pyramids: what a view draws of them, the laws that its cut keeps, and the files that hold them."""
 
-import contextlib
 import itertools
 import json
 import shutil
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from aaplug_cli.main import main
 
 import aaplug
 from aaplug.core import pyramids
@@ -35,7 +33,7 @@ from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import FormatError
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.lod import lod
-from tests.conftest import make_camera, make_scene, make_splats
+from tests.conftest import made_by, make_camera, make_scene, make_splats
 
 RATE = 20.0  # px per world unit
 VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0), (-3.0, -2.0, 0.5)))
@@ -260,11 +258,8 @@ def test_views_between_two_cameras():
 @pytest.fixture(scope="module")
 def built(dataset, tmp_path_factory) -> Path:
     """A folder of levels, made by the command in a copy of the data set."""
-    folder = tmp_path_factory.mktemp("built")
-    shutil.copytree(dataset, folder, dirs_exist_ok=True)
-    with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
-        main(["lod", "scene.ply", "--cameras", ".", "-o", "levels", "--levels", "2", "--steps", "1"])
-    return folder / "levels"
+    words = "lod scene.ply --cameras . -o levels --levels 2 --steps 1"
+    return made_by(words, dataset, tmp_path_factory.mktemp("built")) / "levels"
 
 
 @pytest.fixture

@@ -31,13 +31,6 @@ from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import ROOT, SAMPLE, make_camera, make_scene
 
-EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> list[Camera]:
-    return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(EYES)]
-
 
 def free(camera: Camera) -> Camera:
     return replace(camera, trained_focal=None)

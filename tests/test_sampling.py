@@ -13,7 +13,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import view_information
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.system.errors import FrameError, UsageError
-from tests.conftest import make_camera, make_scene, memory_taken, needs_peak_memory, straight_camera
+from tests.conftest import make_camera, make_scene, memory_taken, moved, needs_peak_memory, straight_camera
 
 FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
 MEMORY_LIMIT = 35e6  # bytes
@@ -24,13 +24,6 @@ def ring(n: int = 7, focal_step: float = 0.2) -> list[Camera]:
     eyes = [(4 * math.cos(a), 3 * math.sin(a), 1.5 * math.sin(3 * a)) for a in range(n)]
     cameras = [make_camera(eye, fov=0.4 + focal_step * (i % 4)) for i, eye in enumerate(eyes)]
     return [replace(cameras[0], fy=cameras[0].fy * 1.3), *cameras[1:]]
-
-
-def moved(camera: Camera, offset: torch.Tensor) -> Camera:
-    """The camera moved by `offset` in the world."""
-    pose = camera.cam_from_world.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset.double()
-    return replace(camera, cam_from_world=pose)
 
 
 def rates_by_loop(mean: list[float], cameras: list[Camera]) -> list[float]:
@@ -168,7 +161,7 @@ def test_the_frame_check_returns_the_share_of_gaussians_seen_and_all_of_none():
 
 def test_cameras_of_another_scene_are_refused():
     means = make_scene(500).means
-    strangers = [moved(camera, torch.tensor([0.0, 0.0, 200.0])) for camera in ring()]
+    strangers = [moved(camera, (0.0, 0.0, 200.0)) for camera in ring()]
     assert check_frame(means, ring(), "garden.ply") > 0.9
     with pytest.raises(FrameError, match=r"garden\.ply: only .*% .*different frames") as caught:
         check_frame(means, strangers, "garden.ply")

@@ -5,7 +5,6 @@ import json
 import re
 import runpy
 import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -19,8 +18,8 @@ from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
 from tests.bench.theory import laws
 from tests.bench.viewers import shown_table
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 GUIDES = ROOT / "examples" / "guides"
 SITE = ROOT / "examples" / "site"
 TOUR = ROOT / "examples" / "tour.ipynb"

@@ -27,7 +27,7 @@ from aaplug.live.subject import Subject
 from aaplug.methods.recipe import LevelChoice
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, with_photographs
 
 SIDES = (Side("classic", "best"), Side("auto", "best"))
 RECIPES = ("classic", "auto", "mip")
@@ -36,8 +36,8 @@ RECIPES = ("classic", "auto", "mip")
 def with_photograph(scene, views, folder) -> CameraSet:
     """The views as trained; the first has a photograph, somewhat darker than the scene."""
     views = [view.as_trained() for view in views]
-    write_png(folder / "0.png", Renderer.of(scene, views, "classic", rasterizer="eager")(views[0]).rgb * 0.9)
-    views[0] = replace(views[0], photo=folder / "0.png")
+    look = Renderer.of(scene, views, "classic", rasterizer="eager")
+    views[:1] = with_photographs(look, views[:1], folder, 0.9).test
     return CameraSet(tuple(views), tuple(views))
 
 

@@ -21,11 +21,11 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.report.plots import plots
-from aaplug.io.images import image_size, write_png
+from aaplug.io.images import image_size
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.compare import compare
 from aaplug.verbs.evaluate import evaluate
-from tests.conftest import click, make_camera, make_scene
+from tests.conftest import click, make_camera, make_scene, with_photographs
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
 PICTURE = "#stage canvas"
@@ -39,12 +39,9 @@ def written(tmp_path_factory):
     scene = make_scene(150)
     views = [make_camera((0.0, -4.0, 0.0), name=NASTY), make_camera((2.0, -4.0, 1.0), name="b")]
     training = TrainingViews.of(scene, views)
-    renderer = Renderer.of(scene, training, "classic", rasterizer="eager")
-    for i, view in enumerate(views):
-        write_png(folder / f"{i}.png", renderer(view).rgb * 0.9 + 0.05)
-        views[i] = replace(view, photo=folder / f"{i}.png")
+    look = Renderer.of(scene, training, "classic", rasterizer="eager")
+    cameras = replace(with_photographs(look, views, folder, 0.9, 0.05), notes=(NASTY,))
     how = {"recipe": ("classic", "auto"), "scale": (1.0, 0.5, 2.0), "background": "black", "rasterizer": "eager"}
-    cameras = CameraSet(tuple(views), tuple(views), notes=(NASTY,))
     report = evaluate(scene, cameras, output=folder, report=True, name=f"scene {NASTY}", **how)
     return folder, report, coverage(scene, training, report.scales)
 

@@ -181,15 +181,6 @@ def test_a_stored_filter_is_fused_and_removed():
     assert fuse_stored(fused) is fused
 
 
-def test_smoothing_has_the_nyquist_variance_at_the_highest_rate():
-    scene = world_scene()
-    training = TrainingViews.of(scene, CAMERAS)
-    smoothed = WORLD_FILTERS["smoothing3d"](scene, training)
-    variances = smoothed.scales.square() - scene.scales.square()
-    expected = 0.2 / training.bounds.highest.square()
-    torch.testing.assert_close(variances, expected[:, None].expand(40, 3), rtol=1e-8, atol=1e-14)
-
-
 def test_gaussians_that_no_camera_saw_are_smoothed_at_the_coarsest_rate_and_not_matched():
     scene = world_scene()
     scene.means[7] = torch.tensor([0.0, -500.0, 0.0])
