@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -100,7 +101,7 @@ def test_errors_of_a_scene_name_options_as_they_are_typed(batch, monkeypatch, ve
     assert "lower --min-seen" in json.loads(out)["scenes"]["scene"]["error"]
     assert "min_seen" not in out + err + Path("out/batch.json").read_text()
 
-    monkeypatch.setattr(f"aaplug.{verb}", full)
+    monkeypatch.setattr(f"aaplug.{verb}", Mock(side_effect=MemoryError))
     code, out, err = batch(f"{verb} --batch one.toml -o out --json --overwrite")
     assert "fewer --threads" in json.loads(out)["scenes"]["scene"]["error"]
 
@@ -196,25 +197,16 @@ def report_of(scale: float = 1.0, protocol: Mapping[str, Any] | None = None, **v
     return lambda **settings: Report((measured,), protocol or {"recipes": {}})
 
 
-def mistaken(**settings):
-    raise ValueError("oh")
-
-
-def full(*words, **settings):
-    raise MemoryError
-
-
 def test_a_lost_cluster_ends_the_batch(tmp_path):
-    def lost(**settings):
-        raise ClusterError("scheduler tcp://a:1", "the connection is lost")
-
+    lost = Mock(side_effect=ClusterError("scheduler tcp://a:1", "the connection is lost"))
     with pytest.raises(ClusterError):
         evaluate_all([("x", lost), ("y", report_of(PSNR=30.0))], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_no_failure_of_a_scene_costs_another(tmp_path):
-    runs = [("x", mistaken), ("y", full), ("x", report_of(PSNR=30.0)), ("z", report_of(PSNR=None))]
+    failing = [Mock(side_effect=error) for error in (ValueError("oh"), MemoryError)]
+    runs = [*zip("xy", failing, strict=True), ("x", report_of(PSNR=30.0)), ("z", report_of(PSNR=None))]
     found = evaluate_all(runs, tmp_path / "out")
     assert list(found.names.values()) == ["x", "y", "x", "z"]
     assert len(set(found.names)) == 4  # folders of their own
@@ -227,9 +219,7 @@ def test_no_failure_of_a_scene_costs_another(tmp_path):
 
 
 def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_other_scales(tmp_path):
-    def refused(**settings):
-        raise UsageError("progress.jsonl", "is of another request")
-
+    refused = Mock(side_effect=UsageError("progress.jsonl", "is of another request"))
     found = evaluate_all([("x", report_of(PSNR=30.0)), ("y", report_of(0.5, PSNR=30.0))], tmp_path / "out")
     assert "no PSNR at 1: some scenes have other scales" in found.tables()
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}

@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -246,8 +246,7 @@ def test_a_kernel_that_ends_a_process_is_built_last_next_time(compiling):
     mark = compiled.package_path(deadly).with_suffix(".so.sha256")
     mark.parent.mkdir()
 
-    def dies(*_: object) -> NoReturn:
-        raise UsageError("worker process", "died")
+    dies = Mock(side_effect=UsageError("worker process", "died"))
 
     def builds(pool: object, work: object, packages: Sequence[tuple[str, None]]) -> Iterator[object]:
         for name, target in packages:
@@ -324,11 +323,7 @@ def test_a_damaged_or_foreign_package_is_left_aside_with_one_line(copied_cache, 
 )
 def test_a_cache_that_cannot_be_used_means_eager_images_and_one_line(copied_cache, monkeypatch, caplog, name, error):
     """A read-only folder, and one that does not allow programs to run."""
-
-    def fails(*args):
-        raise error
-
-    monkeypatch.setattr(compiled, name, fails)
+    monkeypatch.setattr(compiled, name, Mock(side_effect=error))
     assert find_rasterizer("auto") is RASTERIZERS["eager"]
     [line] = caplog.messages
     assert str(error.strerror or error) in line
@@ -569,12 +564,8 @@ def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
 @pytest.fixture
 def failing(monkeypatch):
     """A compiler that cannot compile one of the kernels."""
-
-    def fails(**_: object) -> NoReturn:
-        raise UsageError("warmup", "torch cannot compile slots here")
-
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
-    monkeypatch.setattr(choice, "build", fails)
+    monkeypatch.setattr(choice, "build", Mock(side_effect=UsageError("warmup", "torch cannot compile slots here")))
 
 
 def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, failing):

@@ -6,6 +6,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from aaplug_cli.console import TERMINAL
@@ -85,10 +86,7 @@ def test_a_scene_may_follow_an_option_of_several_values(before):
 
 
 def test_an_error_of_the_system_is_told_by_what_it_is(monkeypatch, capsys):
-    def fails(words):
-        raise OSError(errno.ENOMEM, "Cannot allocate memory")
-
-    monkeypatch.setattr("aaplug_cli.main.run", fails)
+    monkeypatch.setattr("aaplug_cli.main.run", Mock(side_effect=OSError(errno.ENOMEM, "Cannot allocate memory")))
     with pytest.raises(SystemExit, match="2"):
         main(["info"])
     assert capsys.readouterr().err == "error: unexpected OSError: cannot allocate memory\n"

@@ -19,6 +19,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -372,9 +373,7 @@ def test_a_camera_file_without_cameras_is_named(monkeypatch, tmp_path):
 
 
 def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
-    def refuses(*_: Any) -> Any:
-        raise UsageError("scale", "is not for this metric")
-
+    refuses = Mock(side_effect=UsageError("scale", "is not for this metric"))
     with pytest.raises(UsageError, match=r"^scale: is not for this metric$"):
         evaluated(refuses, monkeypatch, tmp_path)
 

@@ -227,15 +227,11 @@ def test_gradients_reach_the_levels_of_a_cut(renderer, levels):
         shown = replace(renderer, scene=replace(scene, logit_opacities=logits))
         return (shown(view).rgb * weights).sum()
 
-    logits = scene.logit_opacities.clone().requires_grad_()
-    (found,) = torch.autograd.grad(loss(logits), logits)
     cut = renderer.cutter(view)
     assert cut.shares is not None
     assert 0 < cut.shares.min() < 1
-    for place in found.abs().topk(3).indices.tolist():
-        step = torch.zeros_like(logits).index_fill_(0, torch.tensor([place]), 1e-5)
-        ends = [loss(logits.detach() + change) for change in (step, -step)]
-        assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(float(found[place]), rel=1e-4)
+    logits = scene.logit_opacities.clone().requires_grad_()
+    assert torch.autograd.gradcheck(loss, logits, rtol=1e-4, atol=1e-6, fast_mode=True)
 
 
 def test_views_between_two_cameras():

@@ -9,6 +9,7 @@ import time
 import webbrowser
 from contextlib import contextmanager
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -224,10 +225,8 @@ def test_a_host_that_cannot_be_listened_at_is_refused_by_name(seen, host):  # no
 
 
 def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
-    def interrupted():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=interrupted)))
+    event = SimpleNamespace(wait=Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: event))
     _, err = cli.done("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
     assert "open http://127.0.0.1:" in err
     assert err.splitlines()[-1] == "closed"
