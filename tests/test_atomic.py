@@ -2,7 +2,6 @@
 
 import errno
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from aaplug.io.layers import write_layers
 from aaplug.io.scenes import write_scene
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
-from tests.conftest import exit_code, make_scene
+from tests.conftest import exit_code, files_of_at_most, make_scene
 
 OLD, NEW = b"old", b"new and longer"
 
@@ -76,13 +75,9 @@ def test_a_full_disk_that_a_library_meets_is_one_line(tmp_path: Path, package: s
     pytest.importorskip(package)
     image = {"rgb": torch.rand(100, 100, 3)}
     how = (write_scene, make_scene(200)) if package == "pxr" else (write_layers, image, Storage.of(Path(name)))
-    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, usual[1]))
-    try:
-        with pytest.raises(OutputError, match=rf"{name}: cannot be written: file too large$"):
-            how[0](tmp_path / name, *how[1:])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    said = rf"{name}: cannot be written: file too large$"
+    with files_of_at_most(10_000), pytest.raises(OutputError, match=said):
+        how[0](tmp_path / name, *how[1:])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -171,18 +166,9 @@ def test_kill_9_before_the_rename_leaves_the_old_file(output: Path, at: str):
 
 
 def test_a_disk_that_fills_up_leaves_the_old_file(output: Path):
-    """A limit of the process stands in for a small disk: writing fails half way, with all that was there in place."""
-
-    def work() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))
-        try:
-            write(output, bytes(1 << 20), overwrite=True)
-        except OutputError as error:
-            os._exit(0 if "cannot be written: file too large" in str(error) else 3)
-        os._exit(4)
-
-    assert exit_code(work) == 0
+    """Writing fails half way, with all that was there in place."""
+    with files_of_at_most(1 << 16), pytest.raises(OutputError, match="cannot be written: file too large"):
+        write(output, bytes(1 << 20), overwrite=True)
     assert only_the_old_file_is_there(output)
 
 

@@ -108,10 +108,11 @@ def test_convert_for_the_rule_of_training_changes_no_byte(cli):
     assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
 
 
-def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, monkeypatch):
-    def dim(scene, training, viewer):
-        return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
+def dim(scene, *_):
+    return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
 
+
+def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, monkeypatch):
     monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
     assert "starting from the original" in cli.done(f"{CONVERT} --for mip --steps 1")[1]
     original, found = (read_scene(Path(name)).gaussians().logit_opacities for name in ("scene.ply", "c.ply"))
@@ -119,9 +120,6 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
 
 
 def test_convert_keeps_the_original_where_nothing_is_as_close(cli, monkeypatch):
-    def dim(scene, *_):
-        return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
-
     monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
     monkeypatch.setattr(
         "aaplug.finetuning.fitting.tuned_scene",

@@ -37,7 +37,7 @@ from aaplug.system.cores import FREE_CORES
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import torch_threads
 from aaplug.verbs.finetune import finetune
-from tests.conftest import make_camera, make_scene, run_python
+from tests.conftest import make_camera, make_scene, moved, run_python
 
 F64 = torch.float64
 EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
@@ -365,16 +365,11 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))
 
 
-def moved(view):
-    pose = view.cam_from_world.clone()
-    pose[0, 3] += 1e-9
-    return replace(view, cam_from_world=pose)
-
-
+A_LITTLE = (1e-9, 0.0, 0.0)
 CHANGES = {
-    "views": lambda job: replace(job, views=[moved(job.views[0]), *job.views[1:]]),
+    "views": lambda job: replace(job, views=[moved(job.views[0], A_LITTLE), *job.views[1:]]),
     "training cameras": lambda job: replace(
-        job, start=replace(job.start, training=replace(job.start.training, cameras=[*map(moved, VIEWS)]))
+        job, start=replace(job.start, training=replace(job.start.training, cameras=[moved(v, A_LITTLE) for v in VIEWS]))
     ),
     "scene": lambda job: replace(
         job, start=replace(job.start, scene=replace(job.start.scene, filter_3d=torch.ones(len(job.start.scene))))

@@ -1,8 +1,5 @@
 """Image files of rendered views: every format gives back what it can hold, and refuses the rest before it draws."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,7 +15,7 @@ from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.layers import write_layers
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import SAMPLE, make_camera, make_scene
+from tests.conftest import SAMPLE, make_camera, make_scene, run_python
 
 needs_exr = pytest.mark.skipif(find_spec("OpenEXR") is None, reason="the package OpenEXR is not installed")
 VIEWS = [make_camera((x / 2, -4.0, 0.3), (40, 30), name=f"v{x}") for x in range(3)]
@@ -97,8 +94,7 @@ np.save(sys.argv[2], cv2.imread(sys.argv[1], cv2.IMREAD_UNCHANGED))
 def test_opencv_reads_the_colours_of_an_exr_bit_for_bit(tmp_path, bit_depth):
     drawn = layers()
     write_layers(tmp_path / "a.exr", drawn, storage("exr", *drawn, bit_depth=bit_depth))
-    command = [sys.executable, "-c", READ_BY_OPENCV, str(tmp_path / "a.exr"), str(tmp_path / "a.npy")]
-    run = subprocess.run(command, env=os.environ | {"OPENCV_IO_ENABLE_OPENEXR": "1"}, capture_output=True, text=True)
+    run = run_python(READ_BY_OPENCV, tmp_path / "a.exr", tmp_path / "a.npy", OPENCV_IO_ENABLE_OPENEXR=1)
     if run.returncode == 77:
         pytest.skip("this build of OpenCV reads no EXR")
     assert run.returncode == 0, run.stderr

@@ -55,11 +55,10 @@ def test_gradients_where_few_tiles_have_splats(counts, kernels):
         torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("place", [(-50.0, 4.0), None], ids=["outside the image", "no splats"])
-def test_gradients_of_what_is_not_drawn_are_0(place):
+def test_gradients_of_what_is_not_drawn_are_0():
     splats = in_tiles(3)
-    splats = splats[:0] if place is None else replace(splats, means=splats.means * 0 + splats.means.new_tensor(place))
-    for grad in gradients(Tiled(), splats, (TILE, TILE)):
+    outside = replace(splats, means=splats.means * 0 + splats.means.new_tensor((-50.0, 4.0)))
+    for grad in gradients(Tiled(), outside, (TILE, TILE)):
         assert grad.eq(0).all()
 
 

@@ -1,7 +1,6 @@
 """Videos: every frame, padded and never resampled, whole or not at all."""
 
 import json
-import resource
 from pathlib import Path
 
 import av
@@ -13,6 +12,7 @@ import torch
 from aaplug.io.video import write_video
 from aaplug.system.errors import OutputError, UsageError
 from aaplug.verbs.video import side_by_side
+from tests.conftest import files_of_at_most
 from tests.test_camera_paths import document
 
 
@@ -93,13 +93,8 @@ def test_white_stays_white_and_gray_gray(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
 def test_a_disk_that_is_full_is_named(tmp_path, suffix):
     noise = [torch.rand(96, 128, 3) for _ in range(20)]
-    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, usual[1]))
-    try:
-        with pytest.raises(OutputError, match="cannot be written"):
-            write_video(tmp_path / f"v{suffix}", noise, 25.0)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    with files_of_at_most(20_000), pytest.raises(OutputError, match="cannot be written"):
+        write_video(tmp_path / f"v{suffix}", noise, 25.0)
     assert list(tmp_path.iterdir()) == []
 
 
