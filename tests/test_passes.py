@@ -47,6 +47,7 @@ def normal_of(tilt: float) -> torch.Tensor:
 
 
 CAMERA = make_camera((0.4, -4.0, 0.3), (96, 72), name="v")
+SMALL = make_camera((0.0, -4.0, 0.3), (64, 48), name="v")
 
 
 def plane_errors(tilt: float, scale: float, axes: NormalAxes = "world") -> dict[str, float]:
@@ -154,12 +155,11 @@ def boxes(layer: torch.Tensor) -> torch.Tensor:
 def test_ids_are_places_in_the_file_also_in_other_processes(tmp_path):
     scene = make_scene(60)
     write_scene(tmp_path / "whole.ply", scene)
-    camera = make_camera((0.0, -4.0, 0.3), (40, 30), name="v")
     kept = aaplug.read_scene(tmp_path / "whole.ply").gaussians()[torch.cat([torch.arange(7), torch.arange(20, 60)])]
     found = []
-    renderer = Renderer.of(kept, [camera], "classic", rasterizer="eager")
+    renderer = Renderer.of(kept, [SMALL], "classic", rasterizer="eager")
     for each in (renderer, renderer.portable()):
-        found.append(each.passes(camera, ["id"])["id"])
+        found.append(each.passes(SMALL, ["id"])["id"])
     assert found[0].equal(found[1])
     drawn = set(found[0].flatten().tolist())
     assert max(drawn) >= 47  # beyond the places of what was kept
@@ -168,20 +168,18 @@ def test_ids_are_places_in_the_file_also_in_other_processes(tmp_path):
 
 
 def test_passes_leave_the_picture_as_it_is():
-    scene, camera = make_scene(200), make_camera((0.0, -4.0, 0.3), (64, 48))
-    renderer = Renderer.of(scene, [camera], rasterizer="eager", background="white")
-    image, drawn = renderer(camera), renderer.passes(camera, list(PASSES))
+    renderer = Renderer.of(make_scene(200), [SMALL], rasterizer="eager", background="white")
+    image, drawn = renderer(SMALL), renderer.passes(SMALL, list(PASSES))
     assert image.rgb.equal(drawn["rgb"])
     assert image.alpha.equal(drawn["alpha"])
     assert list(drawn) == list(PASSES)
-    assert all(drawn[name].equal(renderer.passes(camera, [name])[name]) for name in PASSES)
+    assert all(drawn[name].equal(renderer.passes(SMALL, [name])[name]) for name in PASSES)
     assert all(layer.isfinite().all() for layer in drawn.values())
 
 
 @pytest.mark.parametrize("recipe", ["2dgs", "gaussian-blending", "sa-gs-integral", "mip-splatting"])
 def test_every_kind_of_recipe_serves_every_pass(recipe):
-    camera = make_camera((0.0, -4.0, 0.3), (40, 30))
-    drawn = Renderer.of(make_scene(60), [camera], recipe, rasterizer="eager").passes(camera, list(PASSES))
+    drawn = Renderer.of(make_scene(60), [SMALL], recipe, rasterizer="eager").passes(SMALL, list(PASSES))
     covered = drawn["alpha"] > 0.5
     assert covered.any()
     assert (drawn["id"][covered] >= 0).all()
@@ -189,18 +187,15 @@ def test_every_kind_of_recipe_serves_every_pass(recipe):
 
 
 def test_where_nothing_is_drawn_everything_is_0_and_ids_are_minus_1():
-    camera = make_camera((0.0, -4.0, 0.3), (16, 12))
-    renderer = Renderer.of(make_scene(60)[:0], [camera], "classic", rasterizer="eager")
-    drawn = renderer.passes(camera, list(PASSES))
+    drawn = Renderer.of(make_scene(0), [SMALL], "classic", rasterizer="eager").passes(SMALL, list(PASSES))
     assert (drawn.pop("id") == -1).all()
     assert not any(layer.any() for layer in drawn.values())
 
 
 def test_the_bound_is_the_training_rate_over_the_views():
-    scene, camera = make_scene(60), make_camera((0.0, -4.0, 0.3), (64, 48), name="v")
-    renderer = Renderer.of(scene, [camera], "classic", rasterizer="eager")
-    drawn = renderer.passes(camera, ["bound", "alpha"]), renderer.passes(camera.scaled(0.25), ["bound", "alpha"])
-    for factor, layers in zip((1, 4), drawn, strict=True):
+    renderer = Renderer.of(make_scene(60), [SMALL], "classic", rasterizer="eager")
+    for factor in (1, 4):
+        layers = renderer.passes(SMALL.scaled(1 / factor), ["bound", "alpha"])
         assert torch.allclose(layers["bound"][layers["alpha"] > 0.01], torch.tensor(float(factor)), rtol=1e-3)
 
 
