@@ -9,7 +9,6 @@ import logging
 import math
 import multiprocessing
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -276,6 +275,8 @@ def run_python(program: str, *words: object, **variables: object) -> subprocess.
 @contextlib.contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """No file of this process grows beyond so many bytes, as where a disk is full."""
+    import resource  # which Windows lacks
+
     usual = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, usual[1]))
     try:

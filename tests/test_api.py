@@ -86,3 +86,9 @@ def test_the_version_and_every_folder_of_the_library_are_packaged():
     listed = stated["tool"]["setuptools"]["packages"]
     folders = {".".join(file.parent.relative_to(ROOT).parts) for file in ROOT.glob("aaplug/**/__init__.py")}
     assert set(listed) == folders | {"aaplug_cli", "aaplug_cli.guides"}
+
+
+def test_the_sample_is_small_and_tells_its_origin():
+    files = [path for path in SAMPLE.rglob("*") if path.suffix in {".ply", ".json", ".png", ".md"}]
+    assert sum(path.stat().st_size for path in files) < 6e6
+    assert "CC0" in (SAMPLE / "ORIGIN.md").read_text()

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera, Exposure, Undistortion
+from aaplug.core.colours import WHITE
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
@@ -362,3 +363,16 @@ def test_what_a_recipe_draws_by_is_part_of_the_request(look, views, tmp_path):
     evaluate(first, journal=tmp_path / "journal")
     with pytest.raises(UsageError, match=r"another aaplug \(recipes_sha256.mip changed"):
         evaluate(changed, journal=tmp_path / "journal", resume=True)
+
+
+def test_recipes_rank_as_measured_on_the_sample(sample_scene, sample_cameras, sample_training):
+    """The order that the project stands for, at 1/8 on one photograph; figures are in the README."""
+    recipes = [RECIPES[name] for name in ("classic", "mip", "matched", "auto")]
+    look = own_look(sample_scene, sample_training, "eager", WHITE)
+    renderers = renderers_of(sample_scene, sample_training, recipes, "eager", WHITE)
+    task = Task(renderers, (0.125,), sample_cameras.test[1:2], Truth(look, "photographs"), [PSNR])
+    report = evaluate(task)
+    dB = {name: mean(report.select(name, 0.125), "PSNR") for name in report.recipes}
+    assert dB["classic"] + 7 < dB["mip"] < dB["matched"] < dB["auto"] - 6, dB
+    assert dB["classic"] + 17 < dB["auto"]
+    assert dB[CEILING] - dB["auto"] < 0.7
