@@ -309,7 +309,7 @@ def test_fewer_levels_leave_nothing_of_more(cli, folder):
     cli.done(f"{words} --steps 2 --for spark --overwrite")  # files by a viewer's rule, and no pyramid
     assert sorted(file.name for file in folder.iterdir()) == ["notes.txt", *names]
     for name in names:
-        assert b"fused=finetune steps=2 for=spark" in (folder / name).read_bytes()
+        assert b"SplatRenderMode: mip" in (folder / name).read_bytes()
         assert read_scene(folder / name).gaussians().convention == ANTIALIASED
     for more, said in (("--resume", "levels for aaplug"), ("--no-refine", "is what the result is tuned for")):
         cli.refused(f"{words} --for spark {more}", said)
