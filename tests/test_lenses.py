@@ -1,6 +1,7 @@
 """Lenses: their maps, splats through them, and photographs undistorted, against models written out here."""
 
 import math
+import pickle
 from dataclasses import replace
 
 import cv2
@@ -342,3 +343,9 @@ def test_a_recipe_of_discs_says_that_it_has_no_lens():
     renderer = Renderer.of(scene, [make_camera((0.0, -4.0, 0.0))], "2dgs")
     with pytest.raises(UsageError, match="recipe 2dgs draws pinhole views only"):
         renderer(view_through(EQUIDISTANT))
+
+
+def test_a_renderer_of_another_process_draws_through_a_lens():
+    renderer, view = Renderer.of(make_scene(10), [make_camera((0.0, -4.0, 0.0))], "auto"), view_through(EQUIDISTANT)
+    sent = pickle.loads(pickle.dumps(renderer.portable()))
+    assert torch.equal(sent(view).rgb, renderer(view).rgb)

@@ -73,7 +73,7 @@ def above_nyquist(renderer: Renderer, views: Sequence[Camera], scale: float) -> 
 
     Splats that others hide count as all do.  None if a sample is not a point, or nothing is seen.
     """
-    if renderer.recipe.pixel is not POINT:
+    if renderer.recipe.pixel != POINT:
         return None
     total = above = 0.0
     for view in spread(views, SPECTRUM_VIEWS):

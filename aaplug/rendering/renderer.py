@@ -288,7 +288,7 @@ class Renderer:
             found: dict[str, Tensor] = (exposed or render)._asdict()
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
             recipe = self.recipe_through(splats.camera)
-            per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
+            per_call = (3, 4) if recipe.pixel == POINT and recipe.compositor is None else (3,)
             paint = partial(self.paint, hw=hw, background=BLACK)
             draw = partial(composited, splats, draw=paint, per_call=per_call)
             found |= expected(names, splats, self.scene, self.training.bounds, fine, samples, weight, normal_axes, draw)
@@ -337,7 +337,7 @@ class Renderer:
             return self.recipe
         if self.recipe.order == "tile":
             raise UsageError("order", "tile is for pinhole views; depth draws all")
-        if self.recipe.pixel is not POINT or self.recipe.compositor is not None:
+        if self.recipe.pixel != POINT or self.recipe.compositor is not None:
             problem = f"recipe {self.recipe.name} draws pinhole views only"
             raise UsageError("lens", f"{problem}; auto, matched, classic, ewa and mip draw all")
         return replace(self.recipe, pixel=RAY)
