@@ -11,7 +11,7 @@ import aaplug
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, CameraSet, Exposure
 from aaplug.core.exposures import CELL_SHARE, cells, lattice, opening, sample_cameras, spread
-from aaplug.core.lenses import Lens
+from aaplug.core.lenses import EQUIDISTANT, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
@@ -82,6 +82,22 @@ def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion
     truth = covariance(camera) - covariance(replace(middle, exposure=Exposure(None, None, 1024)))
     truth = torch.stack([truth[:, 0, 0], truth[:, 0, 1], truth[:, 1, 1]], dim=1)
     assert torch.allclose(spread(splats, middle).double(), truth, rtol=0.05, atol=0.05)
+
+
+def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
+    """The camera turns by 149 degrees; points at its height move along a great circle, some to behind their planes."""
+    angle, scene = 2.6, make_scene(30)
+    middle = replace(VIEW, lens=EQUIDISTANT)
+    splats = project(replace(scene, means=scene.means * torch.tensor([1.0, 1.0, 0.0])), middle)
+    ends = []
+    for turn in (-0.1 * angle, 0.9 * angle):
+        (c, s), pose = (math.cos(turn), math.sin(turn)), torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = pose.new_tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        ends.append(replace(middle, cam_from_world=pose @ middle.cam_from_world))
+    path = spread(splats, replace(middle, exposure=Exposure(None, (ends[0], ends[1]))))
+    assert splats.planes is not None
+    lengths = (12 * (path[:, 0] + path[:, 2])).sqrt() / splats.planes[:, 0].norm(dim=1)
+    assert torch.allclose(lengths, torch.full_like(lengths, angle), rtol=1e-3)
 
 
 def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():

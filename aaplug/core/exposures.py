@@ -79,7 +79,10 @@ def spread(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
 
 
 def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 2"]:
-    """Places in px, seen by another camera, of splats that this one sees; through a lens, in the splats' planes."""
+    """Places in px, seen by another camera, of splats that this one sees; through a lens, in the splats' planes.
+
+    Through a lens that is not flat, a distance from the plane's own centre is the angle, as variances there are.
+    """
     focal, middle = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
     one = torch.ones_like(splats.means[:, :1])
     if splats.planes is None or camera.lens.flat:
@@ -94,7 +97,13 @@ def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 
         return other.pixels(seen[:, :2] / seen[:, 2:].clamp(min=NEAR)).clamp(-MAX_SHIFT, MAX_SHIFT)
     zoom = seen.new_tensor([other.fx / camera.fx, other.fy / camera.fy])
     right, down, ahead = torch.einsum("mij,mj->im", splats.planes, seen)
-    return (torch.stack([right, down], dim=1) / ahead.clamp(min=NEAR)[:, None] * zoom).clamp(-MAX_SHIFT, MAX_SHIFT)
+    if camera.lens.flat:
+        scale = 1 / ahead.clamp(min=NEAR)
+    else:  # an angle, which also what lies behind the plane has
+        across = (right**2 + down**2 + torch.finfo(seen.dtype).tiny).sqrt()
+        rate = torch.linalg.vector_norm(splats.planes[:, 0], dim=1)  # px per radian
+        scale = rate * torch.atan2(across / rate, ahead) / across
+    return (torch.stack([right, down], dim=1) * scale[:, None] * zoom).clamp(-MAX_SHIFT, MAX_SHIFT)
 
 
 def opening(aperture: Aperture, u: float, v: float) -> tuple[float, float]:
