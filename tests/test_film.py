@@ -1,5 +1,6 @@
 """Aperture and shutter: samples of the lens and of time, and what each adds to the splats."""
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -11,7 +12,7 @@ import aaplug
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, CameraSet, Exposure
 from aaplug.core.exposures import CELL_SHARE, cells, lattice, opening, sample_cameras, spread
-from aaplug.core.lenses import EQUIDISTANT, Lens
+from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
@@ -23,6 +24,7 @@ from tests.test_camera_paths import document
 
 VIEW = make_camera((0.0, -4.0, 0.0))
 MOVED = make_camera((0.5, -4.0, 0.2))
+ZOOMED = VIEW, replace(MOVED, fx=1.2 * VIEW.fx, fy=1.2 * VIEW.fy, cx=VIEW.cx + 2.0)
 APERTURE = Aperture(radius=0.1, focus=3.0)
 
 
@@ -64,14 +66,21 @@ def test_the_plane_in_focus_stays_and_the_rest_moves():
 
 
 @pytest.mark.parametrize(
-    ("aperture", "motion"),
-    [(APERTURE, None), (Aperture(0.2, 5.0, 6), None), (None, (VIEW, MOVED)), (APERTURE, (VIEW, MOVED))],
+    ("aperture", "motion", "lens"),
+    [
+        (APERTURE, None, PINHOLE),
+        (Aperture(0.2, 5.0, 6), None, PINHOLE),
+        (APERTURE, (VIEW, MOVED), PINHOLE),
+        *itertools.product([None], [(VIEW, MOVED), ZOOMED], [PINHOLE, ORTHO, Lens(radial=(0.02,)), EQUIDISTANT]),
+    ],
 )
-def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion):
-    """The slow twin: places in float64 under the cameras of the samples."""
-    scene, camera = make_scene(30), exposed(aperture, motion, 1024)
-    middle = camera if motion is None else replace(camera, cam_from_world=toward(*motion, 0.5).cam_from_world)
-    splats = project(scene, middle)
+def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion, lens):
+    """The slow twin: places in float64 under the cameras of the samples; a fisheye's planes lie along its image."""
+    scene, camera = make_scene(30), exposed(aperture, None, 1024)
+    if motion is not None:
+        motion = tuple(replace(each, lens=lens) for each in motion)
+        camera = replace(toward(*motion, 0.5), exposure=Exposure(aperture, motion, 1024))
+    splats = project(scene, camera)
     means = scene.means[splats.sources]
 
     def covariance(samples):
@@ -79,9 +88,9 @@ def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion
         offsets = places - places.mean(dim=0)
         return (offsets[..., :, None] * offsets[..., None, :]).mean(dim=0)
 
-    truth = covariance(camera) - covariance(replace(middle, exposure=Exposure(None, None, 1024)))
+    truth = covariance(camera) - covariance(replace(camera, exposure=Exposure(None, None, 1024)))
     truth = torch.stack([truth[:, 0, 0], truth[:, 0, 1], truth[:, 1, 1]], dim=1)
-    assert torch.allclose(spread(splats, middle).double(), truth, rtol=0.05, atol=0.05)
+    assert torch.allclose(spread(splats, camera).double(), truth, rtol=0.05, atol=0.05)
 
 
 def test_through_a_fisheye_a_path_is_as_long_as_its_angle():

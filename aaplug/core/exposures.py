@@ -83,27 +83,27 @@ def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 
 
     Through a lens that is not flat, a distance from the plane's own centre is the angle, as variances there are.
     """
-    focal, middle = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
-    one = torch.ones_like(splats.means[:, :1])
-    if splats.planes is None or camera.lens.flat:
-        places = splats.means - middle if splats.planes is None else -splats.planes[:, :2, 2]
-        rays = torch.cat([places / focal, one], dim=1)
+    lens, planes, depths = camera.lens, splats.planes, splats.depths[:, None]
+    parallel = lens.projection == "ortho"
+    if planes is None or lens.flat:
+        focal, middle = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
+        across = (splats.means - middle if planes is None else -planes[:, :2, 2]) / focal
+        local = torch.cat([across if parallel else across * depths, depths], dim=1)
     else:
-        rays = splats.planes[:, 2]
+        local = planes[:, 2] * depths
     turn = other.cam_from_world[:3, :3] @ camera.cam_from_world[:3, :3].T
     shift = other.cam_from_world[:3, 3] - turn @ camera.cam_from_world[:3, 3]
-    seen = (rays * splats.depths[:, None]) @ turn.T.to(rays) + shift.to(rays)
-    if splats.planes is None:
-        return other.pixels(seen[:, :2] / seen[:, 2:].clamp(min=NEAR)).clamp(-MAX_SHIFT, MAX_SHIFT)
-    zoom = seen.new_tensor([other.fx / camera.fx, other.fy / camera.fy])
-    right, down, ahead = torch.einsum("mij,mj->im", splats.planes, seen)
-    if camera.lens.flat:
-        scale = 1 / ahead.clamp(min=NEAR)
-    else:  # an angle, which also what lies behind the plane has
-        across = (right**2 + down**2 + torch.finfo(seen.dtype).tiny).sqrt()
-        rate = torch.linalg.vector_norm(splats.planes[:, 0], dim=1)  # px per radian
-        scale = rate * torch.atan2(across / rate, ahead) / across
-    return (torch.stack([right, down], dim=1) * scale[:, None] * zoom).clamp(-MAX_SHIFT, MAX_SHIFT)
+    seen = local @ turn.T.to(local) + shift.to(local)
+    if planes is None or lens.flat:
+        places = seen[:, :2] if parallel else seen[:, :2] / seen[:, 2:].clamp(min=NEAR)
+        return other.pixels(places).clamp(-MAX_SHIFT, MAX_SHIFT)
+    if (other.fx, other.fy) != (camera.fx, camera.fy):  # the ray that this camera has there
+        rays = camera.rays(other.pixels(lens.places(seen)))
+        seen = torch.where(rays.any(dim=1, keepdim=True), rays, seen)
+    right, down, ahead = torch.einsum("mij,mj->im", planes, seen)
+    rate = torch.linalg.vector_norm(planes[:, 0], dim=1)  # px per radian
+    length = (right**2 + down**2 + torch.finfo(seen.dtype).tiny).sqrt()
+    return torch.stack([right, down], dim=1) * (rate * torch.atan2(length / rate, ahead) / length)[:, None]
 
 
 def opening(aperture: Aperture, u: float, v: float) -> tuple[float, float]:
