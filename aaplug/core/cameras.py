@@ -175,6 +175,12 @@ class Camera:
         middle = {"cx": cx, "cy": cy, "exposure": self._exposed_as(lambda c: c.framed(width, height))}
         return replace(self, width=width, height=height, fx=self.fx * factor, fy=self.fy * factor, **middle)
 
+    @contract
+    def cropped(self, left: int, top: int, width: Side, height: Side) -> "Camera":
+        """`width` × `height` px of this view, whose corner is `left` and `top` px from its own."""
+        exposure = self._exposed_as(lambda camera: camera.cropped(left, top, width, height))
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, exposure=exposure)
+
     def as_trained(self) -> "Camera":
         """This view, declared to be a pose of the data set at its training size."""
         return replace(self, trained_focal=self.focal)

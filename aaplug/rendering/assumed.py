@@ -153,8 +153,7 @@ def decibels_at(renderer: Renderer, view: Camera, factors: Sequence[float]) -> l
     """PSNR between the middle of a view, and what it would be if training had been `factors` times as fine; in dB."""
     side = max(1, min(CROP_SIDE, CROP_SAMPLES // renderer.samples(view)))
     width, height = min(view.width, side), min(view.height, side)
-    left, top = (view.width - width) // 2, (view.height - height) // 2
-    crop = replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
+    crop = view.cropped((view.width - width) // 2, (view.height - height) // 2, width, height)
     image, decibels = renderer(crop).rgb.clamp(0, 1), []
     for factor in factors:
         trained = None if view.trained_focal is None else view.trained_focal * factor
