@@ -52,10 +52,39 @@ scene.aaplug.frame = origin
 moved = addon.camera_path(scene, frames[:1])
 local = [[*(origin.matrix_world.inverted() @ Vector(row[:3])), *row[3:]] for row in seen[0]]
 (folder / "moved.json").write_text(json.dumps(moved))
-result = {"seen": seen, "local": local}
+scene.aaplug.frame = None
+scene.frame_set(frames[0], subframe=0.5)
+camera.data.dof.focus_object = behind = bpy.data.objects.new("behind", None)
+scene.collection.objects.link(behind)
+
+
+def aperture():
+    bpy.context.view_layer.update()
+    try:
+        return addon.camera_path(scene, frames[:1])["camera_path"][0]["aperture"]
+    except ValueError as error:
+        return str(error)
+
+
+scene.frame_set(frames[0])
+inside = camera.matrix_world.normalized()
+scene.frame_set(frames[0], subframe=0.5)
+behind.location = inside @ Vector((1, 0, 4))
+result = {"seen": seen, "local": local, "behind": aperture()}
+behind.location = inside.translation
+result |= {"in the lens": aperture(), "subframe": scene.frame_subframe}
+skeleton = bpy.data.objects.new("skeleton", bpy.data.armatures.new("skeleton"))
+scene.collection.objects.link(skeleton)
+bpy.context.view_layer.objects.active = skeleton
+bpy.ops.object.mode_set(mode="EDIT")
+bone = skeleton.data.edit_bones.new("eye")
+bone.head, bone.tail = inside @ Vector((0, 0, -5)), inside @ Vector((0, 1, -5))
+bpy.ops.object.mode_set(mode="OBJECT")
+camera.data.dof.focus_object, camera.data.dof.focus_subtarget = skeleton, "eye"
+result["bone"] = aperture()
+camera.data.dof.focus_object = None
 
 if len(sys.argv) > 3:
-    scene.aaplug.frame = None
     scene.aaplug.program, scene.aaplug.splats, scene.aaplug.cameras = sys.argv[3:]
     scene.aaplug.folder, scene.aaplug.options = str(folder / "out"), "--samples 1 --min-seen 0 --threads 1"
     scene.aaplug.goal = "BACKGROUND"
@@ -79,6 +108,7 @@ if len(sys.argv) > 3:
 
     result["no scene"] = refused(splats="nothing.ply")
     result["silent"] = refused(program="false")
+    result["no program"] = refused(program="no-such-program")
     result["not saved"] = refused(folder="//aaplug")
     result["no splats"] = refused(splats="")
     origin.scale, scene.aaplug.frame = (1, 2, 2), origin

@@ -58,6 +58,14 @@ def test_focus_and_f_stop_become_an_aperture(exported):
     assert (aperture.radius, aperture.focus, aperture.blades) == (pytest.approx(0.035 / 4), pytest.approx(7), 6)
 
 
+def test_the_focus_follows_an_object_also_one_behind_and_a_bone(exported):
+    _, result = exported
+    assert result["behind"]["focus"] == pytest.approx(4, rel=1e-5)
+    assert result["bone"]["focus"] == pytest.approx(5, rel=1e-5)
+    assert result["in the lens"] == "frame 3 has a focus distance of 0"
+    assert result["subframe"] == 0.5
+
+
 def test_an_object_stands_for_the_splats_frame(exported):
     folder, result = exported
     [camera] = read_camera_path(folder / "moved.json").cameras
@@ -70,7 +78,8 @@ def test_frames_are_drawn_and_loaded(exported):
     assert result["draw"] == result["draw again"] == ["FINISHED"]
     assert result["background"] == [640, 267, "SEQUENCE", 5]
     assert result["node"] == ["aaplug", "0.webp", 255, 128, 0]
-    assert "nothing.ply" in result["no scene"]
+    assert "Error: nothing.ply" in result["no scene"]
+    assert "Program: no-such-program cannot be started: No such file" in result["no program"]
     assert "false ended with status 1" in result["silent"]
     assert "Folder: save the .blend file first" in result["not saved"]
     assert "Splats: choose a scene" in result["no splats"]

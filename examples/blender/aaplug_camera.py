@@ -12,6 +12,7 @@ from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, PointerProperty, StringProperty
+from mathutils import Vector
 
 bl_info = {
     "name": "aaplug camera",
@@ -30,9 +31,10 @@ NAME = "aaplug"  # of the image, its background and its node
 def camera_path(scene, frames):
     """The path file's content for these frame numbers; the scene keeps its current frame.
 
-    Raises ValueError for a camera that has no perspective lens, and for a Frame that stretches or mirrors.
+    Raises ValueError for a camera that has no perspective lens or no distance in focus, and for a Frame that stretches
+    or mirrors.
     """
-    render, current = scene.render, scene.frame_current
+    render, current, subframe = scene.render, scene.frame_current, scene.frame_subframe
     scale = render.resolution_percentage / 100
     size = max(1, int(render.resolution_x * scale)), max(1, int(render.resolution_y * scale))
     try:
@@ -41,7 +43,7 @@ def camera_path(scene, frames):
             scene.frame_set(frame)
             poses.append(_camera(scene, size))
     finally:
-        scene.frame_set(current)
+        scene.frame_set(current, subframe=subframe)
     path = {
         "camera_type": "perspective",
         "render_width": size[0],
@@ -86,8 +88,12 @@ def _camera(scene, size):
     if dof.use_dof:
         focus = dof.focus_distance
         if dof.focus_object is not None:
-            offset = dof.focus_object.matrix_world.translation - camera.matrix_world.translation
-            focus = -offset.dot(camera.matrix_world.normalized().col[2].to_3d())
+            bone = dof.focus_object.pose.bones.get(dof.focus_subtarget) if dof.focus_object.pose else None
+            place = dof.focus_object.matrix_world @ (bone.head if bone else Vector())
+            offset = place - camera.matrix_world.translation
+            focus = abs(offset.dot(camera.matrix_world.normalized().col[2].to_3d()))  # as Blender takes one behind
+        if not focus > 0:
+            raise ValueError(f"frame {scene.frame_current} has a focus distance of 0")
         radius = camera.data.lens * MILLIMETRE / 2 / dof.aperture_fstop
         blades = dof.aperture_blades if dof.aperture_blades >= 3 else 0
         frame["aperture"] = {"radius": radius / unit, "focus": focus / unit, "blades": blades}
@@ -122,10 +128,12 @@ def draw(scene, frames, folder):
     try:
         done = subprocess.run(words, capture_output=True, text=True)
     except OSError as error:
-        raise ValueError(f"{settings.program} cannot be started: {error}") from error
+        raise ValueError(f"Program: {settings.program} cannot be started: {error.strerror}") from error
     if done.returncode:
         said = (done.stderr or done.stdout).strip().splitlines()[-1:]
-        raise ValueError("".join(said) or f"{settings.program} ended with status {done.returncode}")
+        raise ValueError(
+            "".join(said).removeprefix("error: ") or f"{settings.program} ended with status {done.returncode}"
+        )
     return [image["file"] for image in json.loads(done.stdout)["images"]]
 
 
