@@ -38,8 +38,6 @@ def filmed(
     option = "camera_to" if camera_to else "shutter"
     if camera_to or shutter is not None:
         kinds = {(view.hw, view.lens.projection) for view in (*views, *camera_to)}
-        if any(projection == "ortho" for _, projection in kinds):
-            raise UsageError(option, "moves perspective views; the lens is ortho")
         if len(kinds) > 1:
             raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
     if camera_to:
