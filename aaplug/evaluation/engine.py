@@ -92,10 +92,7 @@ class Task:
         if CEILING in self.renderers or len(set(self.scales)) != len(self.scales):
             raise UsageError("evaluate", "a recipe or a scale is named twice")
         if self.truth.source == "photographs":
-            if not self.resizes:
-                problem = f"protocol {self.truth.protocol.name} moves the camera: no photograph shows that"
-                raise UsageError("truth", problem)
-            source_of(self.views, "photographs")
+            source_of(self.views, "photographs", self.truth.protocol)
 
     @property
     def measured(self) -> tuple[Metric, ...]:

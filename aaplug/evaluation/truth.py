@@ -38,14 +38,20 @@ Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
 
 
-def source_of(views: Sequence[Camera], name: Literal["auto", "photographs", "self"] = "auto") -> TruthSource:
+def source_of(
+    views: Sequence[Camera],
+    name: Literal["auto", "photographs", "self"] = "auto",
+    protocol: Protocol = PROTOCOLS["default"],
+) -> TruthSource:
     """The source of this name; for "auto", photographs if every view has one, else the scene's own render ("self").
 
-    Raises UsageError if the source is photographs and a view has none.
+    Raises UsageError if the source is photographs, and a view has none or the protocol moves the camera.
     """
     missing = [view.name for view in views if view.photo is None]
     if name == "self" or (name == "auto" and missing):
         return "self"
+    if protocol.change != "size":
+        raise UsageError("truth", f"protocol {protocol.name} moves the camera: no photograph shows that")
     if missing:
         raise UsageError(missing[0], NO_PHOTOGRAPH)
     return "photographs"

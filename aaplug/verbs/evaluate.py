@@ -48,7 +48,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     name = options.name or Path(job.scene.title).stem
     recipes, views, scales = job.recipes(options.recipe), job.views, options.scale or protocol.scales
     truth = protocol.truth or "auto" if options.truth == "auto" else options.truth
-    source = source_of(views, truth)
+    source = source_of(views, truth, protocol)
     if truth == "auto":
         photos = f"{sum(view.photo is not None for view in views):,} of {counted(len(views), 'view')} with a photograph"
         job.monitor.say(f"truth: {source}{f' ({photos})' * (source == 'self')}")
@@ -61,10 +61,9 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         if options.poses:
             job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views)[0])
             views = job.views
-        look = job.look(frames, check=False)
+        look = job.look(frames)
         renderers = renderers_of(job.scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(renderers, scales, views, Truth(look, source, protocol), metrics)
-        job.check_fit(look)
         job.announce([*task.renderers.values()], task.sized_views, cost=task.cost)
         job.say_assumed(look)
         choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
