@@ -10,6 +10,7 @@ Inside `writing` they raise it, whatever `overwrite` says, for an output that is
 links.
 """
 
+import errno
 import hashlib
 import os
 import secrets
@@ -71,6 +72,15 @@ def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iter
             raise
     with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
         _sync(target.parent, os.O_RDONLY)
+
+
+@contextmanager
+def told_by_library() -> Iterator[None]:
+    """Raise as OSError what a library that writes a file tells as RuntimeError, such as a full disk."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise of_system(error) or OSError(errno.EIO, str(error)) from error
 
 
 @contextmanager

@@ -5,7 +5,6 @@ alpha.  A .png or .webp stores them straight, divided by alpha; an .exr or .npz 
 from finished pixels, once: scenes are composited in the display values that training saw.
 """
 
-import errno
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,11 +15,10 @@ from torch import Tensor
 
 from aaplug.core.imaging import linear, straight
 from aaplug.core.passes import PASSES
-from aaplug.io.atomic import AnyPath, replacing, replacing_file, write_file
+from aaplug.io.atomic import AnyPath, replacing, replacing_file, told_by_library, write_file
 from aaplug.io.image_formats import COLOURS, Storage
 from aaplug.io.images import encoded
 from aaplug.system.contracts import contract
-from aaplug.system.errors import of_system
 
 INTEROP_IDS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_scene"}  # of the Color Interop Forum
 MAX_HALF = 65504.0  # the largest finite half
@@ -80,9 +78,5 @@ def _write_exr(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     if "rgb" in layers:
         header |= {"colorSpace": COLOURS[storage.colour], "colorInteropID": INTEROP_IDS[storage.colour]}
-    with replacing_file(path, overwrite, ".exr") as temporary:
-        try:
-            with OpenEXR.File(header, channels) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            raise of_system(error) or OSError(errno.EIO, str(error)) from error
+    with replacing_file(path, overwrite, ".exr") as place, told_by_library(), OpenEXR.File(header, channels) as file:
+        file.write(str(place))

@@ -9,7 +9,6 @@ axes; units are taken as they are.  USD has no word for a convention: it stays i
 Written are floats, as the stage's default prim, with y up and a metre per unit.
 """
 
-import errno
 import json
 import os
 import subprocess
@@ -25,14 +24,14 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
-from aaplug.io.atomic import replacing_file
+from aaplug.io.atomic import replacing_file, told_by_library
 from aaplug.io.cameras.usd import module
 from aaplug.io.scenes.packed import floats, half_turn_about_z, logit_of, of_degree, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, text
-from aaplug.system.errors import FormatError, OutputError, of_system
+from aaplug.system.errors import FormatError, OutputError
 from aaplug.system.extras import check_installed
 from aaplug.system.locks import scratch
 
@@ -87,11 +86,15 @@ class UsdFormat:
         if not len(scene):
             raise OutputError(path, f"a .{self.name} cannot hold a scene without Gaussians; write a .ply")
         stage = _stage(scene)
-        with replacing_file(path, overwrite, f".{self.name}") as temporary:
-            try:
-                done = _export(stage, temporary, path.stem)
-            except RuntimeError as error:
-                raise of_system(error) or OSError(errno.EIO, str(error)) from error
+        with replacing_file(path, overwrite, f".{self.name}") as temporary, told_by_library():
+            if self.name != "usdz":
+                done = stage.GetRootLayer().Export(str(temporary))
+            else:
+                with scratch(str(temporary.parent)) as folder:
+                    inner = folder / f"{path.stem}.usdc"
+                    done = stage.GetRootLayer().Export(str(inner))
+                    os.utime(inner, (ZIP_EPOCH, ZIP_EPOCH))  # the package holds it, and is to be the same each time
+                    done = done and module("UsdUtils").CreateNewUsdzPackage(str(inner), str(temporary))
             if not done:
                 raise OutputError(path, "cannot be written: usd-core failed")
 
@@ -131,17 +134,6 @@ def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], u
     motion = prim.matrix("motion", 4, 4).T
     standing_up = FROM_Z_UP @ motion if up == "Z" else motion
     return standing(Gaussians(means, turned, log_scales, logits, sh), standing_up, place)
-
-
-def _export(stage: Any, file: Path, name: str) -> bool:
-    """Write a stage, with the name that it has in a .usdz; False or an error of usd-core's if that fails."""
-    if file.suffix != ".usdz":
-        return stage.GetRootLayer().Export(str(file))
-    with scratch(str(file.parent)) as folder:
-        inner = folder / f"{name}.usdc"
-        done = stage.GetRootLayer().Export(str(inner))
-        os.utime(inner, (ZIP_EPOCH, ZIP_EPOCH))  # the package holds it, and is to be the same each time
-        return done and module("UsdUtils").CreateNewUsdzPackage(str(inner), str(file))
 
 
 def _stage(scene: Gaussians) -> Any:
