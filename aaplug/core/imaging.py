@@ -33,8 +33,8 @@ def over(
             return Render(rgb, alpha)
         background = rgb.new_tensor(background)
     behind = functional.pad(background, (0, rgb.shape[2] - len(background)))
-    # as an outer product, whose gradient is a matrix times a vector
-    return Render(torch.addr(rgb.flatten(0, 1), (1 - alpha).flatten(), behind).view(rgb.shape), alpha)
+    planes = torch.addcmul(rgb.permute(2, 0, 1), behind[:, None, None], 1 - alpha)  # as the rasterizer lays them out
+    return Render(planes.permute(1, 2, 0), alpha)
 
 
 def linear(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
