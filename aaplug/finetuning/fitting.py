@@ -78,7 +78,7 @@ def fit(
     renderers = {ORIGINAL: original, CLOSED_FORM: closed_form}
     before = measure(renderers)
     if steps and is_worse(before, CLOSED_FORM):
-        problem = "the closed form, which `--steps 0` keeps, is worse than the original at some scale"
+        problem = "the closed form is worse than the original at some scale"
         monitor.say(f"{problem}: starting from the original")
         start = original
     usual = SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS

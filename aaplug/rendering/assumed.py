@@ -85,7 +85,7 @@ def up_evidence(scene: Scene, orbit: Orbit, frame: Frame) -> str:
     if _by_nerfstudio(scene):
         return "as nerfstudio wrote the file; --up changes it"
     if frame.up.tolist() == [*DOWN_IS_Y]:
-        return "as nothing says; --up does"
+        return "assumed; --up changes it"
     return "as colours vary most seen from there; --up changes it"
 
 
@@ -98,7 +98,7 @@ def _assumed_training(
     orbit: Orbit, frame: Frame, sample: Gaussians, path: Path | None
 ) -> tuple[tuple[Camera, ...], str]:
     """The assumed training views, and what the assumption rests on."""
-    size, reason = TRAIN_VIEW, "as nothing says; --train-view or --train-rate do"
+    size, reason = TRAIN_VIEW, "the default; --train-view or --train-rate set it"
     if orbit.train_view is not None:
         size, reason = size_of(orbit.train_view, "train_view"), "--train-view"
     elif width := _width_in_run(path):

@@ -103,8 +103,8 @@ class Job(Generic[O_co]):
         colour = background_colour(options.background, self.cameras)
         if options.background == "auto":
             name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
-            unstated = "nothing says" if self.cameras.assumed else "the camera files do not say"
-            say(f"background: {name} ({'from the camera files' if self.cameras.background else unstated})")
+            evidence = "from the camera files" if self.cameras.background else "assumed; --background changes it"
+            say(f"background: {name} ({evidence})")
         rasterizer = options.rasterizer
         if isinstance(rasterizer, str):
             rasterizer = find_rasterizer(rasterizer, frames, say, gradients=gradients)
