@@ -632,16 +632,20 @@ def test_gradients_have_no_gradients_and_say_so(function, dtype):
         gradient.square().sum().backward()
 
 
-@pytest.mark.parametrize(("packed", "lens"), [(True, None), (False, "fisheye")])
-def test_absolute_gradients_are_summed_over_pixels(packed, lens):
+@pytest.mark.parametrize(
+    ("packed", "lens", "mode"), [(True, None, "RGB"), (False, "fisheye", "RGB"), (False, None, "RGB+ED")]
+)
+def test_absolute_gradients_are_summed_over_pixels(monkeypatch, packed, lens, mode):
     values, views = gaussians(12), cameras([make_camera(eye, (4, 2)) for eye in EYES])
-    views |= lens_words(lens, 2) if lens else {}
-    image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
+    views |= {"packed": packed, "render_mode": mode, "absgrad": True} | (lens_words(lens, 2) if lens else {})
+    with monkeypatch.context() as plain:  # as compiled kernels draw it
+        plain.setattr("aaplug.gsplat.drop_in.AbsolutePoint", None)
+        image, alpha, meta = rasterization(**values, **views)
     assert not image.requires_grad
     values["means"].requires_grad_()
-    image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
+    image, alpha, meta = rasterization(**values, **views)
     means2d = meta["means2d"]
-    weights = torch.rand(4, dtype=F64) - 0.5
+    weights = torch.rand(image.shape[-1] + 1, dtype=F64) - 0.5
     parts = (torch.cat([image, alpha], dim=-1) * weights).sum(dim=-1).flatten()
     expected = sum(torch.autograd.grad(part, means2d, retain_graph=True)[0].abs() for part in parts)
     means2d.absgrad.zero_()
@@ -840,6 +844,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "means: expected [*b, n, 3], got float32 [40, 2]": {"means": torch.zeros(40, 2)},
     "quats: expected [*b, n, 4] or None, got float32 [3, 4], n = 40": {"quats": torch.ones(3, 4)},
     "scales: expected [*b, n, 3] or None, got float32 [40], n = 40": {"scales": torch.ones(40)},
+    "quats: expected [*b, n, 4] or None, got float64 [40, 4], *b = [2], n = 40": {"means": torch.zeros(2, 40, 3)},
     "opacities: expected [*b, n], got float32 [40, 1], n = 40": {"opacities": torch.ones(40, 1)},
     "colors: expected shape [40, 3], got [39, 3]": {"colors": torch.ones(39, 3)},
     "colors: expected shape [2, 40, 3], got [3, 40, 3]": {"colors": torch.ones(3, 40, 3)},
@@ -895,6 +900,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "masks: expected shape [2, 28, 40], got [2, 4, 5]": {"masks": torch.ones(2, 4, 5, dtype=torch.bool)},
     "heliocentric: is not an argument of this function of gsplat's": {"heliocentric": 1},
     "rasterizer: 'cuda' is not one of auto, compiled, eager, reference": {"rasterizer": "cuda"},
+    "absgrad: rasterizer reference sums no absolute gradients": {"absgrad": True, "rasterizer": "reference"},
 }
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC, MAX_KERNEL
-from aaplug.core.interfaces import Rasterizer
+from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
@@ -22,6 +22,7 @@ from aaplug.rasterizers.choice import kernels_of
 from aaplug.rendering.passes import composited
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
+from aaplug.system.errors import UsageError
 
 Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
@@ -136,6 +137,8 @@ def rasterization(
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options, (radial_coeffs, tangential_coeffs, thin_prism_coeffs))
     painter = rasterizer_of(rasterizer, means.dtype, means.device.type) if isinstance(rasterizer, str) else rasterizer
+    if absgrad and not isinstance(painter, RunsKernels):
+        raise UsageError("absgrad", f"rasterizer {painter.name} sums no absolute gradients")
     kernels = kernels_of(painter)
     splats, radii = zip(*(splats_of(view, options, kernels) for view in views), strict=True)
     layout = Layout.of([part.sources for part in splats], viewmats.shape[:-2], means.shape[-2], packed)
@@ -154,9 +157,13 @@ def rasterization(
     for part, view, add in zip(splats, views, adders, strict=True):
         with on_free_cores():
             features = features_of(part, view, options, kernels)
-            pixel = POINT if add is None else AbsolutePoint(absolute_gradients_to=add)
-            tracked = torch.is_grad_enabled() and (part.means.requires_grad or features.requires_grad)
-            per_call = CHANNELS_PER_CALL_WITH_GRADIENTS if tracked else CHANNELS_PER_CALL
+            pixel, per_call = POINT, CHANNELS_PER_CALL
+            inputs = (part.means, part.covs, part.opacities, features)
+            if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+                per_call = CHANNELS_PER_CALL_WITH_GRADIENTS
+                if add is not None:  # of all channels at once: absolute values of a few at a time do not add up
+                    pixel = AbsolutePoint(absolute_gradients_to=add)
+                    per_call = (max(*per_call, features.shape[1]),)
             image = composited(part, features, drawer(painter, options, pixel), per_call)
             alpha = image.alpha[..., None]
             images.append((finished(image.rgb, alpha, view, options), alpha))

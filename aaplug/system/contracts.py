@@ -123,7 +123,8 @@ def check_fields(noun: Any) -> None:
 def refuse(name: str, value: Any, term: Term, sizes: Sizes) -> NoReturn:
     """Raise UsageError for a value that does not fit its term."""
     shape = term.words.partition("[")[2].partition("]")[0]
-    said = [f", {dim} = {size}" for dim, size in sizes.items() if dim in shape and isinstance(size, int)]
+    known = {dim: size if isinstance(size, int) else [*size] for dim, size in sizes.items() if size != ()}
+    said = [f", {dim} = {size}" for dim, size in known.items() if dim in shape]
     raise UsageError(name, f"expected {term.words}, got {described(value)}{''.join(said)}")
 
 
