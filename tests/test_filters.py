@@ -6,7 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.sights import sights
 from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import ADAPTIVE_VARIANCE, LEAST_SHARE, Adaptive, AnisotropicSmoothing
 from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
@@ -27,15 +29,18 @@ LONG = replace(FAR, fx=2 * FAR.fx, fy=2 * FAR.fy)
 
 def widened_in_the_world(scene, training, camera):
     """AAA-Gaussians as the paper has it: a variance in the world, of each Gaussian in this view."""
-    depths = project(scene, camera).depths
-    here = ADAPTIVE_VARIANCE * (depths / camera.focal) ** 2
+    here = ADAPTIVE_VARIANCE / sights(scene.means, camera).rates ** 2
     added = torch.maximum(ADAPTIVE_VARIANCE / training.bounds.highest**2, here)
     return replace(scene, log_scales=0.5 * (scene.scales**2 + added[:, None]).log())
 
 
+BENT = Lens("pinhole", radial=(0.1,))
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, ORTHO, EQUIRECT, EQUIDISTANT, BENT], ids=lambda lens: lens.kind)
 @pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
-def test_the_adaptive_filter_equals_a_variance_in_the_world(scale):
-    training, camera = TrainingViews.of(SCENE, [NEAR, FAR]), NEAR.scaled(scale)
+def test_the_adaptive_filter_equals_a_variance_in_the_world(scale, lens):
+    training, camera = TrainingViews.of(SCENE, [NEAR, FAR]), replace(NEAR, lens=lens).scaled(scale)
     raw = project(SCENE, camera)
     assert len(raw) == len(SCENE), "the test needs all of them"
     assert training.bounds.seen.all()

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import shutil
 import statistics
 from dataclasses import replace
@@ -17,7 +18,9 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE
 from aaplug.core.pyramids import Cutter, Pyramid, faded
+from aaplug.core.sights import sights
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.truth import Truth
@@ -176,6 +179,21 @@ def test_a_near_part_is_fine_and_a_far_part_coarse():
     assert octaves[0] == octaves[1] == 0  # each as training saw it
     octaves = cutter.octaves(moved(view, 4 / 6, 4.0))
     assert octaves[0] > octaves[1] > 0
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, ORTHO, EQUIRECT, EQUIDISTANT], ids=lambda lens: lens.kind)
+def test_a_free_camera_draws_the_level_of_its_rate_through_any_lens(lens):
+    """Of a point 37° off the axis, where a panorama and a fisheye sample more finely than on it."""
+    scene = make_scene(3)
+    scene.means[:] = torch.tensor([0.0, 0.0, 1.5])
+    whole = Pyramid.of([scene] * 5, [torch.zeros(3, dtype=torch.int64)] * 5)
+    far, near = make_camera((0.0, -12.0, 0.0), (640, 480)), make_camera((0.0, -2.0, 0.0), (640, 480))
+    factor = 1 / 64 if lens != ORTHO else 1 / 128  # an orthographic focal length is px per world unit
+    free = replace(near, fx=near.fx * factor, fy=near.fy * factor, trained_focal=None, lens=lens)
+    cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [far]))
+    rate, trained = float(sights(scene.means, free).rates[0]), float(cutter.lowest)
+    assert 0 < (octaves := math.log2(trained / rate)) < 4
+    assert float(cutter.octaves(free)) == pytest.approx(octaves, abs=1e-4)
 
 
 @pytest.mark.parametrize("opacity", [0.3, 0.6, 0.98])

@@ -23,6 +23,7 @@ from aaplug.core.lenses import PINHOLE
 from aaplug.core.projection import JACOBIAN_MARGIN
 from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
+from aaplug.core.sights import sights
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.system.contracts import check_fields, contract
@@ -235,11 +236,7 @@ class Cutter:
         """
         rates = torch.full_like(self.radii, self.training.relative_rate(camera))
         if camera.trained_focal is None:
-            pose = camera.cam_from_world.detach().double()
-            depths = self.centres @ pose[2, :3] + pose[2, 3]
-            if not camera.lens.flat:
-                depths = torch.linalg.vector_norm(self.centres - camera.centre, dim=1)
-            now = camera.focal / (depths - self.radii).clamp(min=NEAR)
+            now = sights(self._nearest(camera), camera).rates
             trained = torch.minimum(torch.maximum(now, self.lowest.double()), self.highest.double())
             rates = torch.where(self.highest > 0, now / trained, rates)
         octaves = -rates.log2()
@@ -253,6 +250,14 @@ class Cutter:
         coming = ((octaves - levels + 1) / FADE_OCTAVES).clamp(0, 1)  # of level k: 0 up to k - 1
         coming[0] = 1
         return coming - torch.cat([coming[1:], torch.zeros_like(coming[:1])])
+
+    def _nearest(self, camera: Camera) -> Float[Tensor, "c 3"]:
+        """The place in each chunk's ball nearest to the camera; of a flat lens that of the least depth."""
+        if camera.lens.flat:
+            return self.centres - self.radii[:, None] * camera.cam_from_world[2, :3]
+        towards = camera.centre - self.centres
+        share = self.radii / towards.norm(dim=1).clamp(min=NEAR)
+        return self.centres + share.clamp(max=1)[:, None] * towards
 
     def _frustum(self, camera: Camera) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
         """Normals and offsets, in the world, of the planes around the view; normals · place + offset >= 0 inside."""

@@ -97,18 +97,23 @@ class Adaptive:
         """Filter the splats of one view."""
         bounds = training.bounds[splats.sources]
         finest = bounds.highest.to(splats.depths).where(bounds.seen, 1.0)
-        magnified = torch.where(bounds.seen, camera.focal / splats.depths / finest, 1.0).clamp(min=1.0)
+        now = camera.focal / splats.depths if splats.rates is None else splats.rates
+        magnified = torch.where(bounds.seen, now / finest, 1.0).clamp(min=1.0)
         variance = self.variance * magnified * magnified
         return splats.convolved(variance[:, None] * _sphere(splats, camera), compensate=True)
 
 
 def _sphere(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
-    """Projected covariance of a sphere whose standard deviation is 1 px on the optical axis: (z/f)² J Jᵀ."""
-    centre = splats.means.new_tensor([camera.cx, camera.cy])
-    focal = splats.means.new_tensor([camera.fx, camera.fy])
-    slopes = ((splats.means - centre) / focal).unbind(dim=1)
-    x, y = (s.clamp(*ends) for s, ends in zip(slopes, slope_limits(camera), strict=True))
+    """Projected covariance of a sphere whose standard deviation is 1 px at the view's rate: a pinhole's (z/f)² J Jᵀ."""
+    zero, one = torch.zeros_like(splats.depths), torch.ones_like(splats.depths)
+    if not camera.lens.flat:
+        return torch.stack([one, zero, one], dim=1)
+    focal, centre = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
     fx, fy = (focal / camera.focal).unbind()
+    if camera.lens.projection == "ortho":
+        return torch.stack([fx * fx * one, zero, fy * fy * one], dim=1)
+    places = splats.means - centre if splats.planes is None else -splats.planes[:, :2, 2]
+    x, y = (s.clamp(*ends) for s, ends in zip((places / focal).unbind(dim=1), slope_limits(camera), strict=True))
     return torch.stack([fx * fx * (1 + x * x), fx * fy * x * y, fy * fy * (1 + y * y)], dim=1)
 
 
