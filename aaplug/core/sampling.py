@@ -32,7 +32,7 @@ class SamplingBounds:
     """The facts about a camera set that filters use; all are zero for a Gaussian that no camera sees.
 
     highest, lowest: sampling rate over the cameras that see the Gaussian, in px per world unit.
-    nearest: smallest depth in these cameras, in world units.
+    nearest: smallest focal length over rate in these cameras: of pinholes the smallest depth, in world units.
     views: number of cameras that see it.
     """
 

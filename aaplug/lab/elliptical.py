@@ -26,7 +26,7 @@ from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at,
 
 GAMMA, BETA = 0.5, 2.0  # the third party's guesses; beta is per px
 LEAST_NODES = 3  # along a pixel's side, to which ⌈ln(κ + 1)⌉ are added
-MOST_NODES = 10  # along a pixel's side, which κ up to 1096 need
+MOST_NODES = 10  # along a pixel's side, which κ up to 1095 need
 HALF_U, HALF_V, NODES, FIRST_WEIGHT = range(COLUMNS, COLUMNS + 4)
 
 

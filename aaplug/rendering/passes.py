@@ -5,7 +5,8 @@ front of it:
 
 - depth, position, bound: expected values Σ w_i x_i / Σ w_i, where both sums are over all samples of a pixel, so that
   what is behind a silhouette does not count.  normal: the same, of length 1.  The depth of a flat splat is here that of
-  its plane at the sample, and a position lies on the sample's ray at that depth; everywhere else depths are of centres.
+  its plane at the sample, to first order in the way from its centre, and a position lies on the sample's ray at that
+  depth; everywhere else depths are of centres.
 - depth-median: at a sample the depth of the first splat behind which the transmittance is below a half; at a pixel the
   lower median of its samples, of which those without such a splat are infinitely far.
 - depth-nearest: the least depth of a splat that is drawn, over all samples.
