@@ -93,7 +93,7 @@ class Elliptical(Integral):
         """Nodes along a pixel's side, and κ, at least 1."""
         half_trace = 0.5 * (splats.covs[:, 0] + splats.covs[:, 2])
         longer = half_trace + (half_trace.square() - splats.dets).clamp(min=0).sqrt()
-        kappa = (longer.square() / splats.dets).clamp(min=1)
+        kappa = (longer.square() / splats.dets.clamp(min=torch.finfo(splats.dets.dtype).tiny)).clamp(min=1)
         return (LEAST_NODES + (kappa + 1).log().ceil()).clamp(max=MOST_NODES).detach(), kappa
 
     def weight(self, distance: Tensor, window: float) -> Tensor:

@@ -69,15 +69,19 @@ class Integral:
 
 
 def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
-    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first."""
+    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first.
+
+    What is so small that its determinant underflows is taken for as small a splat that has one.
+    """
     xx, xy, yy = covs.unbind(dim=1)
     across, along = 2 * xy, xx - yy
     circle = (across == 0) & (along == 0)  # any axes do, but the angle has no gradient
     angle = 0.5 * torch.atan2(across.where(~circle, 0.0), along.where(~circle, 1.0))
     half = 0.5 * (xx + yy)
     root = torch.hypot(0.5 * along.where(~circle, 1.0), xy)
-    longer = half + torch.where(circle, 0.0, root)
-    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
+    least = torch.finfo(dets.dtype).tiny
+    longer = (half + torch.where(circle, 0.0, root)).clamp(min=least)
+    wide, thin = longer.rsqrt(), (longer / dets.clamp(min=least)).sqrt()
     cos, sin = angle.cos(), angle.sin()
     return cos * wide, sin * wide, -sin * thin, cos * thin
 

@@ -18,6 +18,7 @@ from aaplug.methods.pixel_kernels.raster_rows import OPACITY, UX, UY, VX, VY
 from aaplug.methods.pixel_kernels.surfel import SLOPE_X, SLOPE_Y, Surfel, intersection, plane_coordinates
 
 DISC_VARIANCE = 0.1  # px²: variance of AA-2DGS's object-space Mip filter
+MOST = 1e8  # of s, t, and their change per px: beyond it a disc on edge is below every cut-off, and squares overflow
 LEAST_FACTOR = 1e-8  # AA-2DGS adds this to 1/det V before the square root, as published
 
 
@@ -37,6 +38,7 @@ class SurfelMip(Surfel):
         ux, uy, vx, vy, nx, ny = (rows[..., i, None] for i in (UX, UY, VX, VY, SLOPE_X, SLOPE_Y))
         j00, j01 = (ux + s * nx) * inverse, (uy + s * ny) * inverse
         j10, j11 = (vx + t * nx) * inverse, (vy + t * ny) * inverse
+        s, t, j00, j01, j10, j11 = (x.clamp(-MOST, MOST) for x in (s, t, j00, j01, j10, j11))
         area = j00 * j11 - j01 * j10
         size = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
         k = DISC_VARIANCE / HALF_LOG2_E

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.methods import RECIPES
@@ -71,6 +72,23 @@ def test_extremes_draw_finite_images(name):
         assert image.isfinite().all(), poison
         assert image[..., 3].min() >= 0, poison
         assert image[..., 3].max() <= 1, poison
+
+
+@pytest.mark.parametrize("recipe", ["analytic", "eaa", "gaussian-blending", "aa-2dgs"])
+def test_what_averages_over_the_pixel_draws_points_and_discs_on_edge(recipe):
+    """Their determinants underflow, or the squares of their whitenings overflow."""
+    camera = Camera("front", 16, 16, 5.0, 5.0, 8.0, 8.0, torch.eye(4))
+    for scales in ((-30.0, -30.0, -30.0), (-math.inf, -math.inf, -1.0), (-30.0, -1.0, -1.0)):
+        scene = replace(
+            make_scene(1),
+            means=torch.tensor([[0.0, 0.0, 4.0]]),
+            quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+            log_scales=torch.tensor([scales]),
+        )
+        for scale in (1.0, 8.0):
+            rgb, alpha = Renderer.of(scene, [camera], recipe, rasterizer="eager")(camera.scaled(scale))
+            assert rgb.isfinite().all(), scales
+            assert 0 <= alpha.min() <= alpha.max() <= 1, scales
 
 
 @pytest.mark.parametrize("name", ALL_RASTERIZERS)
