@@ -22,6 +22,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size
+from aaplug.io.streamed import STREAMS
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.compare import compare
 from aaplug.verbs.evaluate import evaluate
@@ -337,6 +338,16 @@ def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
 
 
 def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_browser_leaves_fingers_to_a_page_of_streamed_levels(browser, name):
+    """Else it would scroll and zoom the page, and cancel the pointers of the viewer."""
+    page = browser.new_page()
+    page.set_content(files("aaplug.io.stream_pages").joinpath(f"{name}.html").read_text())
+    script = "getComputedStyle(document.body.appendChild(document.createElement('canvas'))).touchAction"
+    assert page.evaluate(script) == "none"
+    page.close()
+
+
     """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
     script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()
     page = browser.new_page()
