@@ -280,6 +280,12 @@ def test_the_background_is_chosen_and_forgotten_and_full_screen_goes_on_and_off(
     page.wait_for_function("document.fullscreenElement !== null")
     page.keyboard.press("g")
     page.wait_for_function("document.fullscreenElement === null")
+    page.add_init_script("delete Document.prototype.fullscreenEnabled")  # as on an iPhone
+    page.reload()
+    at_rest(page)
+    assert not page.locator("#full").is_visible()
+    page.keyboard.press("g")
+    assert page.evaluate("document.fullscreenElement") is None
 
 
 def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
@@ -455,6 +461,9 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
     page.fill("#width", "abc")
     page.click("#still")
     page.locator("#said", has_text="got abc").wait_for()
+    page.evaluate("delete Navigator.prototype.clipboard")  # as at the address of another machine, without https
+    page.click("#command")
+    page.locator("#said", has_text="where view.json is saved, run: aaplug render").wait_for()
 
 
 @pytest.mark.parametrize("at", ["0", ""])
@@ -522,8 +531,12 @@ def test_a_lost_page_finds_its_server_again(opened, seen):
 
 @pytest.mark.parametrize(("size", "scheme"), [((375, 667), "dark"), ((820, 1180), "light")])
 def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
-    page = opened(size=size, color_scheme=scheme)
+    page = opened(size=size, color_scheme=scheme, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+    assert "viewport-fit" not in page.content()  # else a notch would hide what is at the edge
+    fields = "[...document.querySelectorAll('select, [inputmode]')]"
+    sizes = page.evaluate(f"{fields}.map(e => parseFloat(getComputedStyle(e).fontSize))")
+    assert min(sizes) >= 16  # px; an iPhone zooms the page to a smaller field and stays there
     small = page.evaluate(
         "[...document.querySelectorAll('#panel *, #status, #names span')].filter(e => e.offsetParent"
         " && e.childElementCount === 0 && e.textContent.trim()"

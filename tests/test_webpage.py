@@ -117,8 +117,8 @@ def opened(browser, written):
     """A function that opens the page in a window of some size and scheme; nothing may have gone wrong in it."""
     troubles, pages, asked = [], [], []
 
-    def open_page(width=1280, height=900, scheme="light", address=""):
-        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+    def open_page(width=1280, height=900, scheme="light", address="", **other):
+        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, **other)
         pages.append(page)
         page.on("console", lambda message: troubles.append(message.text))
         page.on("pageerror", lambda error: troubles.append(str(error)))
@@ -321,13 +321,14 @@ def test_long_names_are_whole_on_a_desktop(browser, tmp_path, plots_drawn_once):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
-    page = opened(390, 844, scheme)
+    page = opened(390, 844, scheme, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     small = page.evaluate(
         "[...document.querySelectorAll('p, td, small, th, dd, dt, label, select, a, .labels')]"
         ".filter(e => e.offsetParent && parseFloat(getComputedStyle(e).fontSize) < 12).length"
     )
     assert small == 0
+    assert page.evaluate("getComputedStyle(document.querySelector('select')).fontSize") == "16px"  # or iPhones zoom
     colours = page.evaluate(
         "['backgroundColor', 'color'].map(k => getComputedStyle(document.body)[k].match(/\\d+/g).map(Number))"
     )
@@ -337,7 +338,6 @@ def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
     assert (max(paper, ink) + 0.05) / (min(paper, ink) + 0.05) > 7  # WCAG's AAA
 
 
-def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_browser_leaves_fingers_to_a_page_of_streamed_levels(browser, name):
     """Else it would scroll and zoom the page, and cancel the pointers of the viewer."""
@@ -348,6 +348,7 @@ def test_a_browser_leaves_fingers_to_a_page_of_streamed_levels(browser, name):
     page.close()
 
 
+def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
     """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
     script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()
     page = browser.new_page()

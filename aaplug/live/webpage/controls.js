@@ -113,7 +113,9 @@ function fold() {
   at("fold").setAttribute("aria-expanded", String(!folded));
 }
 
+at("full").hidden = !document.fullscreenEnabled; // phones may show no page so
 function fullScreen() {
+  if (!document.fullscreenEnabled) return;
   if (document.fullscreenElement) document.exitFullscreen();
   else document.documentElement.requestFullscreen().catch((error) => say(error.message));
 }
@@ -155,7 +157,10 @@ async function copyCommand() { // and save the camera that it names
   const fov = Math.atan(height / 2 / camera.fl_y) * 360 / Math.PI, words = commandLine();
   savePath([{camera_to_world: worldFromCamera(state.pose), fov, ...camera}], VIEW_FILE);
   const what = `where ${VIEW_FILE} is saved, run: ${words}`;
-  await navigator.clipboard.writeText(words).then(() => say(`copied; ${what}`), () => say(what));
+  try {
+    await navigator.clipboard.writeText(words); // there is none at http addresses of other machines
+    say(`copied; ${what}`);
+  } catch { say(what); }
 }
 
 // --------------------------------------------------------------------------------------------------------------- keys
