@@ -348,6 +348,17 @@ def test_a_page_has_the_viewer_beside_it(tmp_path):
     assert not list((tmp_path / "out").glob("*.ply"))
 
 
+def test_a_viewer_beside_a_page_has_no_more_than_the_page_needs(tmp_path):
+    cesium = tmp_path / "modules" / "cesium" / "Build" / "Cesium"
+    needed = {"Cesium.js", "Assets/a.json", "ThirdParty/a.wasm", "Workers/a.js"}
+    for name in {*needed, "index.js", "index.cjs", "Widgets/widgets.css"}:
+        (cesium / name).parent.mkdir(parents=True, exist_ok=True)
+        (cesium / name).touch()
+    made(tmp_path / "out", "3dtiles", page=tmp_path / "modules")
+    viewer = tmp_path / "out" / "viewer"
+    assert {path.relative_to(viewer).as_posix() for path in viewer.rglob("*") if path.is_file()} == needed
+
+
 def test_what_does_not_belong_together_is_refused(tmp_path):
     (tmp_path / "tileset.json").touch()
     for overwrite in (False, True):

@@ -47,6 +47,7 @@ UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again 
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
 ALWAYS = 1e6  # error of the root over that of the coarsest level, so that something is drawn at any distance
 SPLATS = [gltf.SPLATS, gltf.SPZ]
+CESIUM = tuple(f"cesium/Build/Cesium/{name}" for name in ("Cesium.js", "Assets", "ThirdParty", "Workers"))
 SPARK = "@sparkjsdev/spark/dist/spark.module.min.js"
 THREE = (
     "three/build/three.module.min.js",
@@ -84,7 +85,7 @@ class Stream:
 
 STREAMS = {
     "sog": Stream("playcanvas", STREAM_INDEXES["sog"], "meta.json", ("playcanvas/build/playcanvas.min.mjs",)),
-    "3dtiles": Stream("cesium", STREAM_INDEXES["3dtiles"], "splats.spz.glb", ("cesium/Build/Cesium",), 3.0),
+    "3dtiles": Stream("cesium", STREAM_INDEXES["3dtiles"], "splats.spz.glb", CESIUM, 3.0),
     "rad": Stream("spark", STREAM_INDEXES["rad"], "front.ply", (SPARK, *THREE)),
 }
 
@@ -261,7 +262,7 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
     try:
         for program in programs_of(name, modules):
             if program.is_dir():
-                shutil.copytree(program, viewer, dirs_exist_ok=True)
+                shutil.copytree(program, viewer / program.name, dirs_exist_ok=True)
             else:
                 shutil.copy(program, viewer)
     except OSError as error:
