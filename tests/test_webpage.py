@@ -303,14 +303,20 @@ def test_an_address_of_a_section_or_of_nonsense_does_no_harm(opened):
         assert (data(page, "shown"), data(page, "lens"), data(page, "split")) == (usual, "off", "0.500")
 
 
-def test_long_names_are_whole_on_a_desktop(browser, tmp_path, plots_drawn_once):
+def test_long_names_are_whole_on_a_desktop_and_on_paper(browser, tmp_path, plots_drawn_once):
     scenes = {f"a_scene_whose_name_is_as_long_as_{name}.ply": make_scene(150, seed) for seed, name in enumerate("ab")}
     scenes["x" * 200] = make_scene(150, 2)
     views = tuple(make_camera((place, -4.0, 1.0), name=f"view_at_{place}_metres") for place in (0.0, 2.0))
     compare(scenes, CameraSet(views, views), tmp_path, metric="psnr", rasterizer="eager", any_frame=True)
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((tmp_path / "report.html").as_uri())
-    assert page.evaluate("[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)")
+    whole = "[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)"
+    assert page.evaluate(whole)
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": 700, "height": 1000})  # of A4 between margins
+    assert page.evaluate(whole)
+    page.emulate_media(media="screen")
+    page.set_viewport_size({"width": 1280, "height": 900})
     choose(page, *list(scenes)[1:])
     page.wait_for_function("document.querySelector('#stage .labels').lastChild.textContent.startsWith('x')")
     assert page.evaluate("document.documentElement.scrollWidth") == 1280
