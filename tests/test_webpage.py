@@ -344,6 +344,12 @@ def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
     assert (max(paper, ink) + 0.05) / (min(paper, ink) + 0.05) > 7  # WCAG's AAA
 
 
+def test_one_sees_what_is_chosen_in_the_colours_of_a_system_with_high_contrast(opened):
+    script = "[...document.querySelectorAll('body, #scales span')].map(e => getComputedStyle(e).backgroundColor)"
+    *others, chosen = opened(forced_colors="active").evaluate(script)
+    assert chosen not in others
+
+
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_browser_leaves_fingers_to_a_page_of_streamed_levels(browser, name):
     """Else it would scroll and zoom the page, and cancel the pointers of the viewer."""
