@@ -25,8 +25,11 @@ from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.projection import project
 from aaplug.core.training import TrainingViews
+from aaplug.gsplat.choice import OnlyCompiled
 from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels import point
+from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rasterizers import RASTERIZERS, choice
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages
@@ -550,9 +553,28 @@ def test_missing_kernels_are_built_beside_the_work_and_taken_up_once(empty_cache
         project(make_scene(50), make_camera(), kernels)
     assert (empty_cache / "asked").read_text() == "project"
     assert looked_up == ["project", "project"]
-    assert caplog.messages[0].startswith("kernels run eagerly")
+    assert caplog.messages[0].startswith("this program is slower")
     assert "the disk is full" in caplog.messages[1]
     assert len(caplog.messages) == 2
+
+
+@pytest.mark.parametrize(
+    ("built", "at_once", "with_gradients"),
+    [([], [3], [3]), (["composite-point-4"], [3, 4], [3]), (["-kept", "-backward"], [3], [3, 4])],
+)
+def test_four_channels_are_composited_together_where_their_kernels_are_built_and_else_asked_for(
+    empty_cache, monkeypatch, built, at_once, with_gradients
+):
+    kernels, package = on_demand.OnDemandKernels(), Package(Mock(), [], [], ())
+    monkeypatch.setattr(kernels, "_package_of", lambda of: package if of.name.endswith(tuple(built)) else None)
+    monkeypatch.setattr(kernels, "_can_build", True)
+    for asked in (kernels, OnlyCompiled(kernels), packages.CountingKernels(kernels, Mock())):
+        assert choice.channels_at_once(Tiled(asked), POINT) == at_once
+        assert choice.channels_at_once(Tiled(asked), POINT, gradients=True) == with_gradients
+        assert choice.channels_at_once(Tiled(asked), RAY) == [3]
+    needed = ["composite-point-4", "composite-point-4-kept", "composite-point-4-backward"]
+    assert kernels._missing == {name for name in needed if not name.endswith(tuple(built))}
+    assert choice.channels_at_once(RASTERIZERS["eager"], POINT, gradients=True) == [3, 4]
 
 
 def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):

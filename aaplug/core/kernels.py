@@ -94,6 +94,10 @@ class Kernels:
         """Run one stage."""
         return tuple(self.runner(kernel, args)(*args))
 
+    def ready(self, kernel: Kernel) -> bool:
+        """True unless the kernel runs eagerly where others are compiled."""
+        return True
+
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
         """The function of a stage, for many small calls.
 

@@ -41,7 +41,7 @@ class OnlyCompiled(Kernels):
     """Runs kernels as the given ones do, and refuses to composite eagerly."""
 
     def __init__(self, kernels: Kernels):
-        self.kernels, self.name, self.tiles = kernels, kernels.name, kernels.tiles
+        self.kernels, self.name, self.tiles, self.ready = kernels, kernels.name, kernels.tiles, kernels.ready
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
         """The function of a stage; a leading size of 1 is always run eagerly."""

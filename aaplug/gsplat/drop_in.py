@@ -18,7 +18,7 @@ from aaplug.gsplat.drawing import drawer, features_of, finished, splats_of
 from aaplug.gsplat.table import Layout, conics
 from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.rasterizers.choice import kernels_of
+from aaplug.rasterizers.choice import CHANNELS, channels_at_once, kernels_of
 from aaplug.rendering.passes import composited
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
@@ -28,9 +28,6 @@ Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
 Kernel = Annotated[float, Range(0, MAX_KERNEL)]
 MaxAlpha = Annotated[float, Range(above=RULES_GSPLAT.min_alpha, most=1 - 1e-6)]
-CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
-# With gradients, torch's compiler fails on four channels; a part without a gradient, as of unused depth, costs nothing.
-CHANNELS_PER_CALL_WITH_GRADIENTS = (3,)
 
 
 @contract
@@ -157,13 +154,11 @@ def rasterization(
     for part, view, add in zip(splats, views, adders, strict=True):
         with on_free_cores():
             features = features_of(part, view, options, kernels)
-            pixel, per_call = POINT, CHANNELS_PER_CALL
             inputs = (part.means, part.covs, part.opacities, features)
-            if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-                per_call = CHANNELS_PER_CALL_WITH_GRADIENTS
-                if add is not None:  # of all channels at once: absolute values of a few at a time do not add up
-                    pixel = AbsolutePoint(absolute_gradients_to=add)
-                    per_call = (max(*per_call, features.shape[1]),)
+            gradients = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+            pixel, per_call = POINT, channels_at_once(painter, POINT, gradients)
+            if gradients and add is not None:  # of all channels: absolute values of a few at a time do not add up
+                pixel, per_call = AbsolutePoint(absolute_gradients_to=add), [max(CHANNELS, features.shape[1])]
             image = composited(part, features, drawer(painter, options, pixel), per_call)
             alpha = image.alpha[..., None]
             images.append((finished(image.rgb, alpha, view, options), alpha))

@@ -3,21 +3,35 @@
 import os
 from collections.abc import Callable
 
-from aaplug.core.interfaces import Rasterizer, RunsKernels
+from aaplug.core.interfaces import PixelKernel, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import BUNDLE_VARIABLE, KERNELS, build, has_compiler, is_built, load
+from aaplug.rasterizers.tiled.backward import step_kernel
+from aaplug.rasterizers.tiled.forward import pass_kernel
 from aaplug.rasterizers.tiled.on_demand import OnDemandKernels
 from aaplug.system.errors import UsageError, not_one_of
 
 # Compiled, an 800 x 800 frame is 0.3 s faster and a step with gradients 1.5 s; compiling takes three minutes.
 FRAMES_THAT_PAY, STEPS_THAT_PAY = 400, 100
+CHANNELS = 3  # of a colour
 
 
 def kernels_of(rasterizer: Rasterizer) -> Kernels:
     """The kernels that run the stages before a rasterizer, as it runs its own."""
     return rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
+
+
+def channels_at_once(rasterizer: Rasterizer, pixel: PixelKernel, gradients: bool = False) -> list[int]:
+    """The numbers of channels that it may composite at a time: three or, where no kernel for them is missing, four."""
+    if pixel != POINT:
+        return [CHANNELS]
+    kernels, more = kernels_of(rasterizer), CHANNELS + 1
+    needed = [pass_kernel(pixel, more, gradients), *[step_kernel(pixel, more)] * gradients]
+    ready = [kernels.ready(kernel) for kernel in needed]
+    return [CHANNELS, more] if all(ready) else [CHANNELS]
 
 
 def find_rasterizer(

@@ -48,7 +48,7 @@ from aaplug.methods.pixel_kernels.ray import RAY, with_copies
 from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rasterizers.choice import find_rasterizer, kernels_of
+from aaplug.rasterizers.choice import CHANNELS, channels_at_once, find_rasterizer, kernels_of
 from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
@@ -288,7 +288,7 @@ class Renderer:
             found: dict[str, Tensor] = (exposed or render)._asdict()
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
             recipe = self.recipe_through(splats.camera)
-            per_call = (3, 4) if recipe.pixel == POINT and recipe.compositor is None else (3,)
+            per_call = [CHANNELS] if recipe.compositor else channels_at_once(self.rasterizer, recipe.pixel)
             paint = partial(self.paint, hw=hw, background=BLACK)
             draw = partial(composited, splats, draw=paint, per_call=per_call)
             found |= expected(names, splats, self.scene, self.training.bounds, fine, samples, weight, normal_axes, draw)

@@ -73,17 +73,22 @@ KERNELS: tuple[Kernel, ...] = (  # with those of lenses and of gradients
     forward.pass_kernel(POINT, keeps=True),
     backward.step_kernel(POINT),
 )
-# What a trainer asks of `aaplug.gsplat` beside these: absolute gradients, and depth as a fourth channel of images.
+# What a trainer asks of `aaplug.gsplat` beside these: absolute gradients, and depth as a fourth channel.
 TRAINER_KERNELS: tuple[Kernel, ...] = (
     layout.lines_kernel(5),
     forward.pass_kernel(POINT, 4),
+    forward.pass_kernel(POINT, 4, keeps=True),
+    backward.step_kernel(POINT, 4),
     forward.pass_kernel(ABSOLUTE_POINT, keeps=True),
     backward.step_kernel(ABSOLUTE_POINT),
+    forward.pass_kernel(ABSOLUTE_POINT, 4, keeps=True),
+    backward.step_kernel(ABSOLUTE_POINT, 4),
 )
+DRAWN = [(pixel, channels) for pixel in (POINT, ABSOLUTE_POINT) for channels in (3, 4)]
 SLOW = {  # to compile: how many times as long as most, which take about 10 s of a processor
-    **dict.fromkeys((forward.pass_kernel(POINT, keeps=keeps).name for keeps in (False, True)), 6),
+    **{forward.pass_kernel(*drawn, keeps).name: 6 for drawn in DRAWN for keeps in (False, True)},
     projection.PROJECT_BACKWARD.name: 4,
-    backward.step_kernel(POINT).name: 3,
+    **{backward.step_kernel(*drawn).name: 3 for drawn in DRAWN},
     **{shading.gradients_kernel(n).name: 2 for n in shading.COMPILED_COEFFICIENTS[1:]},
 }
 OPTIONS = {

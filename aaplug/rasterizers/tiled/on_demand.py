@@ -54,7 +54,7 @@ class OnDemandKernels(CompiledKernels):
             self._next_look = time.monotonic() + PATIENCE_SECONDS
             known = self._missing <= {kernel.name for kernel in KERNELS}
             when = f"beside this program after {PATIENCE_SECONDS:.0f} s{', or before it by `aaplug warmup`' * known}"
-            log.warning("kernels run eagerly, several times slower, until they are compiled: %s", when)
+            log.warning("this program is slower, some of it several times, until its kernels are compiled: %s", when)
         return runner
 
     def _package(self, kernel: Kernel) -> Package | None:

@@ -88,6 +88,10 @@ class CompiledKernels(Kernels):
         backward = None if gradient is None else self._package(gradient)
         return kernel.function if backward is None else partial(_Tracked.apply, package, backward)
 
+    def ready(self, kernel: Kernel) -> bool:
+        """True if the kernel is compiled."""
+        return self._package(kernel) is not None
+
     def _package(self, kernel: Kernel) -> Package | None:
         if kernel.name not in self._packages:
             self._packages[kernel.name] = self._package_of(kernel)
@@ -132,7 +136,7 @@ class CountingKernels(Kernels):
     def __init__(self, kernels: Kernels, add: Callable[[int, bool], None]):
         """add: called with a run's splat-pixel evaluations, 0 if it does not composite, and whether it is compiled."""
         self._kernels, self._add = kernels, add
-        self.name, self.tiles = kernels.name, kernels.tiles
+        self.name, self.tiles, self.ready = kernels.name, kernels.tiles, kernels.ready
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
         """The function that runs a kernel, and counts."""
