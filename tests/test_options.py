@@ -81,6 +81,8 @@ REFUSED = {
     "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
     "render s.ply -o -": "error: -: is no file: nothing is read from stdin or written to stdout; name a file",
     "info -": "error: -: is no file",
+    "info https://a.org/s.ply": "error: https://a.org/s.ply: is an address: nothing is read from or written to",
+    "merge s.ply -o S3://b/s.glb": "error: S3://b/s.glb: is an address",
     "render s.ply -o": "Missing value for argument '-o/--output'",
     "render s.ply t.ply -o x": "Unrecognized words: t.ply",
     "render s.ply -o x --json=3": "Unrecognized words: 3; see",

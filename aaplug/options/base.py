@@ -3,6 +3,7 @@
 import ast
 import inspect
 import os
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
 
 Bound = int | float
+ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # such as https://; a drive of Windows has one letter
 PYTHON_ONLY = "python only"  # marks an option that the command line does not offer
 
 
@@ -131,10 +133,12 @@ def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any
 def as_path(word: str) -> Path:
     """The path that a word names; ~ is the user's home, which shells leave to the program in `--output=~/a.ply`.
 
-    Raises UsageError for "-", which other programs take for their standard input or output.
+    Raises UsageError for "-", which other programs take for their standard input or output, and for an address.
     """
     if word == "-":
         raise UsageError(word, "is no file: nothing is read from stdin or written to stdout; name a file")
+    if ADDRESS.match(word):
+        raise UsageError(word, "is an address: nothing is read from or written to the network; name a file")
     return Path(os.path.expanduser(word))
 
 
