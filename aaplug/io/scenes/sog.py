@@ -41,7 +41,7 @@ from aaplug.io.scenes.packed import (
     replacing_group,
     without_largest,
 )
-from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
+from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, warn_of_moves, whole
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, natural, number, object_of, parse_json, read_bounded
@@ -220,8 +220,11 @@ def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
     low, high = (part.pixels[i][rows, :3].astype(np.float64) for i in range(2))
     least, most = part.entry.vector("mins", 3), part.entry.vector("maxs", 3)
     span = torch.where(most == least, 1.0, most - least)
-    logs = least + span * torch.from_numpy((low + 256 * high) / 65535)
-    return (logs.sign() * logs.abs().expm1()).float()
+    return _unsquashed(least + span * torch.from_numpy((low + 256 * high) / 65535)).float()
+
+
+def _unsquashed(logs: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return logs.sign() * logs.abs().expm1()
 
 
 def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
@@ -265,7 +268,9 @@ def encoded(path: Path, parts: Iterable[Gaussians]) -> tuple[dict[str, Any], dic
     scene = whole(path, parts, name, MOST_DEGREE, flat=True)
     logs = scene.means.double().sign() * scene.means.double().abs().log1p()
     least, most = logs.amin(dim=0), logs.amax(dim=0)
-    steps = ((logs - least) / torch.where(most > least, most - least, 1.0) * 65535).round().long()
+    span = torch.where(most > least, most - least, 1.0)
+    steps = ((logs - least) / span * 65535).round().long()
+    warn_of_moves(path, name, [(scene, _unsquashed(least + span * steps / 65535) - scene.means)])
     rest, largest = without_largest(scene.unit_quats)
     log_scales = scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     scale_levels, colour_levels = codebook(log_scales.flatten(), LEVELS), codebook(scene.sh[:, 0].flatten(), LEVELS)

@@ -55,6 +55,14 @@ MAGNITUDE_MASK = 511  # 9 bits of a quaternion's component; the tenth is its sig
 MAX_OLD_GAUSSIANS, MAX_OLD_DEGREE = 10_000_000, 3  # accepted by readers of versions before 4 (nianticlabs/spz)
 MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
+# a quaternion times 1, i, j or k is the same Gaussian, turned by half about one of its own axes
+HALF_TURNED = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+HALF_TURN_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
+MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
+POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
+# a quaternion times 1, i, j or k, by the component that is then w: the same Gaussian, turned by halves about its axes
+HALF_TURNED = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+HALF_TURN_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
 ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 RECORD = struct.Struct("<II")  # an extension's type and length
 COORDINATES = 0xADBE0003  # the type SPZ_ADOBE_coordinate_system: one of these numbers
@@ -286,17 +294,16 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
 
 def _columns(scene: Gaussians, version: int, fraction: int) -> list[bytes]:
     """The sections of a scene; the inverse of `rows`."""
-    fixed = (scene.means.double() * 2**fraction).round().to(torch.int32)
+    fixed = (scene.means.double() * 2**fraction).round().clamp(max=(1 << POSITION_BITS) - 1).to(torch.int32)
     positions = fixed.numpy().astype("<i4").view(np.uint8).reshape(len(scene), 3, 4)[..., :3]
-    xyzw = scene.unit_quats.roll(-1, dims=1).double()
     if version >= WORD_QUATERNIONS_VERSION:
-        rest, largest = without_largest(xyzw)
+        rest, largest = without_largest(scene.unit_quats.roll(-1, dims=1).double())
         parts = (rest * (2**0.5 * MAGNITUDE_MASK)).round().long()
         fields = parts.abs().clamp(max=MAGNITUDE_MASK) + (MAGNITUDE_MASK + 1) * (parts < 0)
         words = largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
         quats = words.numpy().astype("<u4")
     else:
-        quats = bytes_of((xyzw[:, :3] * torch.where(xyzw[:, 3:] < 0, -1.0, 1.0) + 1) * 127.5)
+        quats = _three_bytes(scene.unit_quats)
     columns = [
         positions,
         bytes_of(scene.opacities * 255),
@@ -306,3 +313,16 @@ def _columns(scene: Gaussians, version: int, fraction: int) -> list[bytes]:
         bytes_of(scene.sh[:, 1:] * 128 + 128),
     ]
     return [column.tobytes() for column in columns]
+
+
+def _three_bytes(quats: Float[Tensor, "n 4"]) -> np.ndarray:
+    """Bytes of x, y and z of unit quaternions, wxyz, or of the half turn that these bytes hold best.
+
+    Readers take w from the other three.  Where it is small, it would put the Gaussian up to 9 degrees off.
+    """
+    turned = quats.double()[:, HALF_TURNED] * HALF_TURN_SIGNS  # n, four, wxyz
+    turned = turned * torch.where(turned[..., :1] < 0, -1.0, 1.0)
+    steps = ((turned[..., 1:] + 1) * 127.5).round()
+    read = largest_last((steps / 127.5 - 1).flatten(0, 1), torch.zeros(4 * len(quats)))
+    best = (torch.nn.functional.normalize(read).view_as(turned) * turned).sum(dim=2).argmax(dim=1)
+    return bytes_of(steps[torch.arange(len(quats)), best])
