@@ -223,11 +223,23 @@ def test_nothing_is_left_of_a_longer_run_that_was_cut_short_and_parts_are_for_th
                 read_scene(path)
 
 
-@pytest.mark.parametrize(("text", "said"), [("{}", "a list of parts"), ("[[1, 2]]", "7 numbers"), ("", "JSON")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{}", "parts_1.json.*a list of parts"),
+        ("[]", "parts_1.json.*a list of parts"),
+        ("[[1, 2], []]", "parts_1.json.*7 numbers"),
+        ("", "parts_1.json.*JSON"),
+        ("[[]]", "the same number of parts; parts_0.json lists 2, parts_1.json lists 1; .*--overwrite"),
+        ("[[], [1, 0, 0, 0, 1, 1, 1]]", "1_1/meta.json: is missing: parts_1.json lists it; .*--overwrite"),
+    ],
+)
 def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
-    streamed.facts_file(tmp_path, 0).write_text(text)
-    with pytest.raises(FormatError, match=f"parts_0.json.*{said}"):
-        streamed.write_index(tmp_path, "sog", 1, 1.0, frame_of(SCENE))
+    streamed.write_level(tmp_path, "sog", 0, [SCENE, SCENE])
+    streamed.write_level(tmp_path, "sog", 1, [SCENE[:1], SCENE[:0]])
+    streamed.facts_file(tmp_path, 1).write_text(text)
+    with pytest.raises(FormatError, match=said):
+        streamed.write_index(tmp_path, "sog", 2, 1.0, frame_of(SCENE))
 
 
 def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypatch):

@@ -58,6 +58,7 @@ TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
 SETTINGS, PAGE, ORBIT = "settings.json", "index.html", "orbit.js"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 FACTS = 7  # numbers that tell of a part: its Gaussians, and the smallest and largest coordinates
+MAKE_AGAIN = "`aaplug lod --overwrite` makes all levels again"
 NOTHING = [0.0, *[math.inf] * 3, *[-math.inf] * 3]  # of an empty part
 
 
@@ -213,7 +214,11 @@ def write_index(
     if tree is not None:
         content, settings = rad_of(tree_of(tree.scene, tree.parents)), _spark_settings(tree)
     else:
-        parts = torch.tensor([_read_parts(facts_file(folder, n)) for n in range(levels)], dtype=torch.float64)
+        facts = [_read_parts(folder, stream, number) for number in range(levels)]
+        if len({*map(len, facts)}) > 1:
+            listed = ", ".join(f"{facts_file(folder, n).name} lists {len(each)}" for n, each in enumerate(facts))
+            raise FormatError(folder, f"every level should have the same number of parts; {listed}; {MAKE_AGAIN}")
+        parts = torch.tensor(facts, dtype=torch.float64)
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
         content = _json(index)
         if name == "sog":
@@ -236,10 +241,14 @@ def _json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=1).encode()
 
 
-def _read_parts(path: Path) -> list[list[float]]:
-    """The facts that `write_level` wrote about a level's parts."""
+def _read_parts(folder: Path, stream: Stream, level: int) -> list[list[float]]:
+    """The facts that `write_level` wrote about a level's parts, whose files must be there."""
+    path = facts_file(folder, level)
     document, place = read_json(path), Place(path, "the file")
-    place.expect(isinstance(document, list), "it", "a list of parts", document)
+    place.expect(isinstance(document, list) and len(document) > 0, "it", "a list of parts", document)
+    for leaf, fact in enumerate(document):
+        if fact and not (content := folder / stream.part(level, leaf)).is_file():
+            raise FormatError(content, f"is missing: {path.name} lists it; {MAKE_AGAIN}")
     return [numbers(fact, FACTS, place, "a part") if fact else NOTHING for fact in document]
 
 
