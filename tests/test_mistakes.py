@@ -54,7 +54,14 @@ def test_a_full_disk_behind_stdout_is_one_line(cli, words):
 @pytest.mark.parametrize("words", ["render -o LONG/x", "evaluate --recipe classic -o LONG", "convert -o LONG.ply"])
 def test_names_longer_than_the_file_system_takes(cli, words):
     cli.refused(f"info {LONG}.ply", "name too long")
-    cli.refused(f"{words.replace('LONG', LONG)} --cameras . scene.ply", "name too long")
+    words = words.replace("LONG", LONG)
+    cli.refused(f"{words} --cameras . scene.ply", f" {words.split()[-1]}: cannot be written: file name too long")
+
+
+@pytest.mark.parametrize("words", ["render", "evaluate --recipe classic", "compare scene.ply", "lod"])
+def test_a_folder_that_cannot_be_looked_into(cli, words):
+    Path("loop").symlink_to("loop")
+    cli.refused(f"{words} scene.ply --cameras . -o loop", " loop: cannot be written: too many levels of symbolic links")
 
 
 def test_views_with_long_names_are_written(cli):

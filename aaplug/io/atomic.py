@@ -150,9 +150,9 @@ def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ())
 
 
 def check_name(path: AnyPath) -> None:
-    """Refuse an output whose name the file system does not take."""
+    """Refuse an output whose name the file system does not take, or a folder that may not be looked into."""
     try:
-        Path(path).lstat()
+        os.lstat(os.path.join(path, "."))
     except (FileNotFoundError, NotADirectoryError):
         return
     except (OSError, ValueError) as error:

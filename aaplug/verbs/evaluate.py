@@ -14,7 +14,7 @@ from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import PAGE, RESULTS, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
-from aaplug.io.atomic import AnyPath, refuse_existing
+from aaplug.io.atomic import AnyPath, check_name, refuse_existing
 from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -114,6 +114,7 @@ def check_journalled(
         for option in [name for name, is_asked in (*asked.items(), ("resume", resume)) if is_asked]:
             raise UsageError(option, "needs a folder; give `output`")
         return
+    check_name(folder)
     if (folder / JOURNAL).exists() and not (overwrite or resume):
         raise OutputError(folder, f"holds {what}; `resume` continues it, `overwrite` starts anew")
     refuse_existing([folder / name for name in (JOURNAL, *files)], overwrite or resume)
