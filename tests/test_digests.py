@@ -7,6 +7,8 @@ import torch
 
 from aaplug.core.gaussians import digest_of_scene
 from aaplug.methods import RECIPES
+from aaplug.system.digests import digest_of_files
+from aaplug.system.errors import FormatError
 from tests.conftest import make_scene, sized
 
 SCENE = sized(make_scene(5))
@@ -30,3 +32,10 @@ def test_a_recipe_is_known_by_what_it_draws_by():
     auto = RECIPES["auto"]
     assert replace(auto, when="always").digest == auto.digest
     assert replace(auto, target_rate=0.6).digest != auto.digest
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "folder").mkdir()
+    for name, problem in (("missing", "no such file or directory"), ("folder", "is a directory")):
+        with pytest.raises(FormatError, match=f"{name}: cannot be read: {problem}"):
+            digest_of_files([tmp_path / name])

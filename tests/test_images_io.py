@@ -154,9 +154,16 @@ def test_other_containers_are_refused(tmp_path: Path, kind: str):
 def test_junk_and_missing_files_are_named(tmp_path: Path):
     (tmp_path / "junk.png").write_bytes(b"not an image at all")
     (tmp_path / "empty.png").touch()
-    for name in ("junk.png", "empty.png", "missing.png", "."):
+    (tmp_path / "folder.png").mkdir()
+    not_an_image = "is not an image that can be read"
+    for name, problem in (
+        ("junk.png", not_an_image),
+        ("empty.png", not_an_image),
+        ("missing.png", "does not exist"),
+        ("folder.png", "cannot be read: is a directory"),
+    ):
         for read in (image_size, lambda path: read_image(path, None)):
-            with pytest.raises(FormatError, match=name):
+            with pytest.raises(FormatError, match=f"{name}: {problem}"):
                 read(tmp_path / name)
 
 

@@ -33,7 +33,7 @@ from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of, reason
 from aaplug.system.executors import torch_threads
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
@@ -156,6 +156,8 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
     except Exception as error:  # Pillow's parsers raise all kinds
+        if isinstance(error, OSError) and error.strerror:  # the system's
+            raise FormatError(path, f"cannot be read: {reason(error)}") from error
         raise FormatError(path, f"is not an image that can be read ({listing(FORMATS)})") from error
     finally:
         Image.MAX_IMAGE_PIXELS = pillow_limit

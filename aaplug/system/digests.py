@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterable
 from os import PathLike
 
+from aaplug.system.errors import FormatError, reason
+
 MEMORY_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")  # in `repr` of a function, and of an object without one of its own
 
 
@@ -12,12 +14,15 @@ def digest_of_files(paths: Iterable[str | PathLike[str]]) -> str:
     """Hash of the files' contents, one after another.
 
     Raises:
-        OSError: a file cannot be read.
+        FormatError: a file cannot be read.
     """
     digest = hashlib.sha256()
     for path in paths:
-        with open(path, "rb") as stream:
-            hashlib.file_digest(stream, lambda: digest)
+        try:
+            with open(path, "rb") as stream:
+                hashlib.file_digest(stream, lambda: digest)
+        except OSError as error:
+            raise FormatError(path, f"cannot be read: {reason(error)}") from error
     return digest.hexdigest()
 
 
