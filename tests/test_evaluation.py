@@ -258,7 +258,7 @@ def test_a_journal_that_was_edited_by_hand_is_refused(look, views, tmp_path):
         else:
             line["measurements"][1]["view" if key == "name" else key] = value
         path.write_text("\n".join([*kept, json.dumps(line), ""]))
-        with pytest.raises(FormatError, match="its line 3 is damaged"):
+        with pytest.raises(FormatError, match="its line 3 is damaged; remove the file to start again"):
             evaluate(work, journal=path, resume=True)
 
 

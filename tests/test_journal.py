@@ -41,9 +41,12 @@ def test_a_torn_line_is_forgotten_and_written_again(path, end, views):
     assert path.read_bytes() == whole
 
 
-def test_another_request_is_refused_by_what_changed(path):
-    with pytest.raises(UsageError, match=r"another aaplug \(scales, versions.torch changed"):
-        Journal(path, {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}, resume=True)
+def test_another_request_is_refused_by_what_changed_until_the_journal_is_removed(path):
+    other = {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}
+    with pytest.raises(UsageError, match=r"another aaplug \(scales, versions.torch changed.* or remove the file"):
+        Journal(path, other, resume=True)
+    path.unlink()
+    assert not Journal(path, other, resume=True).views
 
 
 def test_without_resume_it_starts_anew(path):

@@ -20,6 +20,7 @@ from aaplug.system.errors import FormatError, OutputError, UsageError, listing, 
 from aaplug.system.locks import lock
 
 JOURNAL = "progress.jsonl"
+ANEW = "remove the file to start again"  # `overwrite` would start all scenes of a batch again
 
 Fits = Callable[[int, Sequence[Measurement]], bool]
 
@@ -94,25 +95,24 @@ class Journal:
                 return
             first, now = lines[0], self._request
             before = first.get("request") if isinstance(first, dict) else None
-            check_request(path, before if isinstance(before, dict) else {}, now)
+            check_request(path, before if isinstance(before, dict) else {}, now, ANEW)
             for number, line in enumerate(lines[1:], start=2):
                 try:
                     view, measurements = line["view"], tuple(map(_measurement, line["measurements"]))
                     if type(view) is not int or view in self.views or not fits(view, measurements):
                         raise ValueError(line)
                 except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-                    raise FormatError(path, f"its line {number} is damaged; start again with `overwrite`") from error
+                    raise FormatError(path, f"its line {number} is damaged; {ANEW}") from error
                 self.views[view] = measurements
             stack.pop_all()  # the stream stays open
             self._stream = stream
 
 
-def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to continue what was asked for otherwise; path: where that is written."""
+def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], anew: str) -> None:
+    """Refuse to continue what was asked for otherwise; path: where that is written.  anew: how to start again."""
     if changed := [*_changes(before, now)]:
-        how = "repeat that request, or start again with `overwrite`, not `resume`"
         what = f"is of another request or another aaplug ({listing(changed)} changed since)"
-        raise UsageError(str(path), f"{what}; {how}")
+        raise UsageError(str(path), f"{what}; repeat that request, or {anew}")
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:

@@ -19,6 +19,7 @@ from aaplug.verbs.views import SUFFIXES, names_image
 PLACES = re.compile("#+")  # of a frame's number in a name
 SEPARATORS = "._-"  # between it and the rest
 USUAL_NAME = "frame.####"  # in a folder
+ANEW = "start again with `overwrite`, not `resume`"
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,8 @@ class FrameSequence:
             try:
                 before = dict(json.loads(self.record.read_bytes()))
             except (OSError, ValueError, TypeError) as error:
-                raise FormatError(self.record, "is damaged; start again with `overwrite`") from error
-            check_request(self.record, before, now)
+                raise FormatError(self.record, f"is damaged; {ANEW}") from error
+            check_request(self.record, before, now, ANEW)
             return [place for place, path in enumerate(self.paths) if not path.exists()]
         for path in self.paths:
             if path.exists():
