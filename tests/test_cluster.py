@@ -4,10 +4,12 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from itertools import count
@@ -19,7 +21,7 @@ import pytest
 
 import aaplug
 from aaplug.evaluation.journal import Journal
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import ClusterError, FormatError, UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.locks import SCRATCH_PREFIX, remove_left
 from aaplug.system.monitor import SILENT, Monitor
@@ -162,6 +164,34 @@ def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
     monkeypatch.setattr(cluster, "VERSIONS", {"no-such-package": "1"})
     with pytest.raises(UsageError, match="has no no-such-package, expected 1"):
         local.check()
+
+
+@contextmanager
+def answering(text: bytes) -> Iterator[str]:
+    """Address of a program that says this to its first caller."""
+
+    def answer() -> None:
+        with server.accept()[0] as caller, suppress(OSError):
+            caller.sendall(text)
+            while caller.recv(4096):
+                pass
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=answer).start()
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_what_answers_and_is_no_scheduler_is_told(local, tmp_path, monkeypatch):
+    local.client.wait_for_workers(1)  # another test may have killed it
+    monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
+    with answering(b"") as silent, answering(b"HTTP/1.0") as page:
+        for address, problem in (
+            (silent, "nothing answers there within 0 s"),
+            (page, "what answers there is not Dask"),
+            (min(local.client.nthreads()), "a Dask worker answers there, expected a scheduler"),
+        ):
+            with pytest.raises(ClusterError, match=f"scheduler {address}: {problem}"):
+                cluster.connected(address, 0, tmp_path, SILENT).__enter__()
 
 
 def test_a_cluster_without_workers_is_lost_after_a_while(local, monkeypatch):

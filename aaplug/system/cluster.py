@@ -5,6 +5,7 @@ its first item comes, and keeps it; only items and results pass through the sche
 done again elsewhere, so work must bear being done twice.
 """
 
+import asyncio
 import logging
 import math
 import os
@@ -26,6 +27,9 @@ import torch
 from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
+from distributed.core import rpc
+from distributed.security import Security
+from distributed.utils import LoopRunner
 
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, counted, listing, reason
@@ -183,11 +187,25 @@ def _client(address: str) -> Client:
         got = address[:MAX_VALUE_CHARACTERS]
         raise UsageError("scheduler", f"takes local or an address such as tcp://host:8786, got {got}")
     try:
+        if (found := LoopRunner(asynchronous=False).run_sync(_kind, address)) != "Scheduler":
+            raise ClusterError(f"scheduler {address}", f"a Dask {found.lower()} answers there, expected a scheduler")
         return Client(address, timeout=ANSWER_SECONDS, set_as_default=False)
     except OSError as error:
         raise ClusterError(f"scheduler {address}", f"nothing answers there within {ANSWER_SECONDS:.0f} s") from error
+    except MemoryError as error:  # Dask takes the first word for a number of bytes
+        raise ClusterError(f"scheduler {address}", "what answers there is not Dask") from error
     except (ValueError, TypeError, ImportError) as error:
         raise UsageError(f"scheduler {address}", f"Dask cannot connect so: {reason(error)}") from error
+
+
+async def _kind(address: str) -> str:
+    """What of Dask answers at an address; `Client` would wait for ever where something listens and says nothing."""
+
+    async def asked() -> dict[str, Any]:
+        async with rpc(address, connection_args=Security().get_connection_args("client")) as there:
+            return cast(dict[str, Any], await there.identity())
+
+    return (await asyncio.wait_for(asked(), ANSWER_SECONDS))["type"]
 
 
 def _local(workers: int, folder: Path) -> LocalCluster:
