@@ -74,8 +74,8 @@ def test_extremes_draw_finite_images(name):
         assert image[..., 3].max() <= 1, poison
 
 
-@pytest.mark.parametrize("recipe", ["analytic", "eaa", "gaussian-blending", "aa-2dgs"])
-def test_what_averages_over_the_pixel_draws_points_and_discs_on_edge(recipe):
+@pytest.mark.parametrize("recipe", ["analytic", "eaa", "gaussian-blending", "aa-2dgs", "2dgs", "2dgs-matched"])
+def test_points_and_discs_on_edge_are_drawn(recipe):
     """Their determinants underflow, or the squares of their whitenings overflow."""
     camera = Camera("front", 16, 16, 5.0, 5.0, 8.0, 8.0, torch.eye(4))
     for scales in ((-30.0, -30.0, -30.0), (-math.inf, -math.inf, -1.0), (-30.0, -1.0, -1.0)):

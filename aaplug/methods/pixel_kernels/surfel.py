@@ -79,7 +79,8 @@ class Surfel:
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
         """Scaled forms, opacity as its log2 (see `point`), depth slopes, and the scaled form of the low-pass filter."""
         assert splats.depth_slopes is not None
-        forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(splats.covs, splats.dets)]
+        dets = splats.dets.clamp(min=torch.finfo(splats.dets.dtype).tiny)  # of discs that are points or stand on edge
+        forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(splats.covs, dets)]
         opacities = splats.opacities.clamp(min=torch.finfo(splats.opacities.dtype).tiny).log2() - LOG2_PADDING
         low_pass = torch.full_like(opacities, HALF_LOG2_E / self.filter_variance(splats.window))
         columns = [*splats.depth_slopes.unbind(dim=1), low_pass]
