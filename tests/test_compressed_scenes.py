@@ -468,6 +468,15 @@ def test_spz_streams_are_held_to_their_size(tmp_path: Path):
         read_scene(tmp_path / "a.spz").gaussians()
 
 
+def test_a_damaged_byte_in_the_streams_of_a_spz_is_noticed(tmp_path: Path):
+    write_scene(tmp_path / "a.spz", replace(oracle(), origin=None))
+    whole = (tmp_path / "a.spz").read_bytes()
+    for place in range(len(whole) // 2, len(whole), 37):  # beyond the header and the list of streams
+        (tmp_path / "a.spz").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(FormatError, match=r"a\.spz"):
+            read_scene(tmp_path / "a.spz").gaussians()
+
+
 @pytest.mark.parametrize("level", [0, 2])
 def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int):
     for offset in (4, 16, 20, 4096, 4104, 4108, 4128, 4132, 4136):

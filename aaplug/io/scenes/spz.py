@@ -286,7 +286,8 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     if old:
         return gzip.compress(HEADER.pack(MAGIC, *facts, flags, 0) + b"".join(sections), mtime=0)
     record = RECORD.pack(COORDINATES, 4) + AXES.index(axes).to_bytes(4, "little")
-    streams = [(zstandard.ZstdCompressor(ZSTD_LEVEL).compress(data), len(data)) for data in sections if data]
+    compressor = zstandard.ZstdCompressor(ZSTD_LEVEL, write_checksum=True)
+    streams = [(compressor.compress(data), len(data)) for data in sections if data]
     start = HEADER_4.pack(MAGIC, *facts, flags | EXTENSIONS_FLAG, len(streams), HEADER_4.size + len(record))
     table = b"".join(STREAM.pack(len(data), size) for data, size in streams)
     return start + record + table + b"".join(data for data, _ in streams)
