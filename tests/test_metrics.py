@@ -10,17 +10,9 @@ from torch.nn.functional import pad
 
 from aaplug.evaluation import METRICS, PROTOCOLS
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.metrics import (
-    SSIM,
-    default_metrics,
-    energy_drift,
-    find_metrics,
-    flicker,
-    metric_option,
-    psnr,
-    ssim,
-)
+from aaplug.evaluation.metrics import SSIM, default_metrics, energy_drift, find_metrics, flicker, psnr, ssim
 from aaplug.system.errors import UsageError
+from aaplug.system.registry import spelt
 from tests.test_lpips import lpips_weights
 
 
@@ -97,6 +89,8 @@ def test_a_metric_gives_one_number_of_any_type():
 def test_a_metric_of_neither_kind_is_refused():
     with pytest.raises(UsageError, match="needs either `measure` or `figure`"):
         Metric("nothing", "", 1.0, 2, "neither")
+    with pytest.raises(UsageError, match="digits: expected an integer from 0, got -1"):
+        Metric("mean", "", 1.0, -1, "of both", lambda image, truth: 0.0)
 
 
 def test_metrics_are_found_by_name_in_the_flavour_of_the_protocol():
@@ -106,7 +100,7 @@ def test_metrics_are_found_by_name_in_the_flavour_of_the_protocol():
     assert found[1] is SSIM["3dgs"]
     assert default_metrics(blender) == ("psnr", "ssim", "consistency", "energy-drift")
     assert default_metrics(PROTOCOLS["fov"]) == ("psnr", "ssim")
-    assert all(metric_option(name) == name for name in default_metrics(blender))
+    assert all(spelt(name) == name for name in default_metrics(blender))
 
 
 @pytest.mark.parametrize(

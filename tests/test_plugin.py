@@ -378,6 +378,34 @@ def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
         evaluated(refuses, monkeypatch, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "object", "problem"),
+    [
+        ("psnr", "odd", "a metric named 'PSNR' exists already"),
+        ("other", "odd", "is registered as 'other' but calls itself 'odd'"),
+        ("class", "Metric", "is the class Metric, which is not a metric"),
+        ("missing", "nothing", "cannot be imported: AttributeError"),
+    ],
+)
+def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, monkeypatch):
+    module = ModuleType("left")
+    vars(module).update(Metric=Metric, odd=replace(METRICS["PSNR"], name="odd"))
+    monkeypatch.setitem(sys.modules, "left", module)
+    metrics = Registry("metric", "aaplug.evaluation.metric:Metric", {"PSNR": METRICS["PSNR"]})
+    monkeypatch.setattr("aaplug.evaluation.METRICS", metrics)
+    point = EntryPoint(name, f"left:{object}", "aaplug.metrics")
+    monkeypatch.setattr("aaplug.system.registry._points_of", lambda kind: (point,) * (kind == "metric"))
+    verdict = next(each for each in check_plugin("left") if each.problem)
+    assert (verdict.kind, verdict.name, verdict.law) == ("metric", name, "Its entry point registers it.")
+    assert verdict.problem.startswith(problem)
+
+
+def test_what_lacks_a_part_of_its_interface_is_told_it():
+    kernels = Registry("pixel kernel", "aaplug.core.interfaces:PixelKernel", {})
+    with pytest.raises(UsageError, match="not a pixel kernel as it lacks columns, needs_depth_slopes, splats_per_pass"):
+        kernels.register("odd", Mock(spec=["name", "bounding_ellipses", "raster_rows", "alpha", "exact"]))
+
+
 def test_an_import_that_ends_the_program_is_told(tmp_path, monkeypatch):
     (tmp_path / "ends_here.py").write_text("\nraise SystemExit(3)\n")
     monkeypatch.syspath_prepend(tmp_path)

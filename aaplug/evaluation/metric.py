@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.interfaces import CountsEvaluations
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.contracts import check_fields
+from aaplug.system.contracts import Range, check_fields
 from aaplug.system.errors import PlugInError, UsageError
 from aaplug.system.plug_ins import asked
 
@@ -121,7 +121,7 @@ class Metric:
     name: str
     unit: str
     ideal: float
-    digits: int
+    digits: Annotated[int, Range(0)]
     protocol: str
     measure: Callable[[Image, Image], float | None] | None = None
     figure: Callable[[Series], float | None] | None = None

@@ -25,9 +25,9 @@ from aaplug.evaluation.lpips import LPIPS, lpips_metric
 from aaplug.evaluation.metric import Image, Metric, Series
 from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
 from aaplug.io.atomic import AnyPath
-from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
 from aaplug.system.extras import check_installed
+from aaplug.system.registry import spelt
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -172,14 +172,14 @@ def find_metrics(
     Raises UsageError if a name is not known or given twice or a metric lacks what it needs, and FormatError.
     """
     names = default_metrics(protocol) if names is None else (names,) if isinstance(names, str) else names
-    parts = [metric_option(name).partition(":") for name in names]
+    parts = [spelt(name).partition(":") for name in names]
     if lpips_weights is not None and not any(name == "lpips" for name, _, _ in parts):
         parts.append(("lpips", "", ""))
     for name, colon, flavour in parts:
         if colon and flavour not in FLAVOURS.get(name, ()):
             flavours = [f"{metric}:{f}" for metric in FLAVOURS for f in FLAVOURS[metric]]
             raise UsageError("metric", not_one_of(f"{name}:{flavour}", flavours))
-    options = {metric_option(name): metric for name, metric in METRICS.items()}
+    options = {spelt(name): metric for name, metric in METRICS.items()}
     if unknown := [name for name, _, _ in parts if name not in options]:
         raise UsageError("metric", not_one_of(unknown[0], options))
     metrics = [options[name] for name, _, _ in parts]
@@ -197,4 +197,4 @@ def find_metrics(
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:
     """Names of what is measured where the user chooses nothing."""
     figures = (CONSISTENCY, ENERGY) if protocol.change == "size" else ()
-    return tuple(metric_option(m.name) for m in (PSNR, SSIM[protocol.ssim], *figures))
+    return tuple(spelt(m.name) for m in (PSNR, SSIM[protocol.ssim], *figures))

@@ -248,8 +248,3 @@ class Orbit(Options):
         for name in ("orbit", "elevation"):
             if self.eye is not None and getattr(self, name) is not None:
                 raise UsageError("eye", f"is a single place, which `{name}` would change; give one")
-
-
-def metric_option(name: str) -> str:
-    """A metric's name as an option's value."""
-    return name.casefold().replace(" ", "-")

@@ -39,15 +39,14 @@ from aaplug.options.shared import (
     RecipeOptions,
     Viewer,
     ViewOptions,
-    metric_option,
     size_of,
 )
 from aaplug.system.errors import UsageError, listing
-from aaplug.system.registry import names_of
+from aaplug.system.registry import names_of, spelt
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
-METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=None)
+METRICS = flag("|".join(map(spelt, names_of("metric"))) + " ...", count=None)
 USUAL_METHOD = "consistency"  # of fine-tuning
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 SINGLE_FILE_FACTOR = 2  # times as many steps for one scene, whose count is met, and for a tree, which is for all sizes

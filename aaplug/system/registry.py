@@ -62,6 +62,7 @@ class Registry(Mapping[str, T]):
         self.kind, self._type_at = kind, type_at
         self._built_in: dict[str, T | str] = dict(own)
         self._entries: dict[str, T] = {}  # loaded
+        self.left_out: dict[EntryPoint, str] = {}  # plug-ins that cannot be used, and why
         self._plug_ins_loaded = False
         self._loading = set[int]()  # threads that load plug-ins; no lock, as an import that waits for it would not end
 
@@ -124,9 +125,14 @@ class Registry(Mapping[str, T]):
         """
         self._load_plug_ins()
         where = f"{self.kind} {name}"
-        if name in self._built_in or name in self._entries:
-            raise UsageError(where, f"{one(self.kind)} named '{name}' exists already")
+        self._check_new(name, self._entries, where)
         self._add(name, value, where)
+
+    def _check_new(self, name: str, entries: Iterable[str], where: str) -> None:
+        """Raise UsageError if aaplug has an entry of that name, or these do; case and spaces tell none apart."""
+        for known in (*self._built_in, *entries):
+            if spelt(known) == spelt(name):
+                raise UsageError(where, f"{one(self.kind)} named '{known}' exists already")
 
     def _load_plug_ins(self) -> None:
         thread = get_ident()
@@ -147,14 +153,14 @@ class Registry(Mapping[str, T]):
             try:
                 if point.dist and point.dist.name == "aaplug" and find_spec(point.module.rpartition(".")[0]) is None:
                     continue  # the folder for comparisons may be deleted
-                if point.name in self._built_in:
-                    raise UsageError(where, f"{one(self.kind)} named '{point.name}' exists already")
+                self._check_new(point.name, self._entries.keys() - {point.name}, where)
                 try:
                     value = point.load()
                 except (Exception, SystemExit) as error:  # a plug-in can fail in any way
                     raise UsageError(where, f"cannot be imported: {of_import(error, point.module)}") from error
                 self._add(point.name, value, where)
             except UsageError as error:
+                self.left_out[point] = error.problem
                 log.warning("%s; it is left out", error)
 
     def _add(self, name: str, value: T, where: str) -> None:
@@ -162,11 +168,25 @@ class Registry(Mapping[str, T]):
             raise UsageError(where, f"{one(self.kind)} named '{name}' exists already")
         if isinstance(value, type) or not isinstance(value, self.type):
             noun = f"the class {value.__name__}" if isinstance(value, type) else one(type(value).__name__)
-            raise UsageError(where, f"is {noun}, which is not a {self.kind}; see `aaplug guide contributing`")
+            lacking = [] if isinstance(value, type) else [m for m in _members(self.type) if not hasattr(value, m)]
+            lacks = f" as it lacks {', '.join(lacking)}" if lacking else ""
+            raise UsageError(where, f"is {noun}, which is not a {self.kind}{lacks}; see `aaplug guide contributing`")
         name_inside = getattr(value, "name", name)
         if name_inside != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{name_inside}'")
         self._entries[name] = value
+
+
+def spelt(name: str) -> str:
+    """A name as an option's value: in any case, with "-" for a space."""
+    return name.casefold().replace(" ", "-")
+
+
+def _members(interface: Any) -> list[str]:
+    """Names of what an object of a kind has; none if objects are told by their class."""
+    if not getattr(interface, "_is_protocol", False):
+        return []
+    return [name for name in vars(interface) if name == "__call__" or not name.startswith("_")]
 
 
 def of_import(error: BaseException, module: str) -> str:

@@ -14,7 +14,7 @@ from aaplug.evaluation.laws import LAWS
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError, failure
 from aaplug.system.monitor import SILENT, Monitor
-from aaplug.system.registry import group_of, of_import, registry_of
+from aaplug.system.registry import REGISTRIES, group_of, of_import, registry_of
 
 MAX_PROBLEM = 300  # characters of a broken law's message
 
@@ -32,14 +32,18 @@ class Verdict(NamedTuple):
 def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     """Run the laws of its kind on each object of a module, and on each that its package's entry points name.
 
+    An entry point whose object is left out, as its name is taken for example, is a broken law.
+
     Raises:
         UsageError: the module cannot be imported, or there is nothing with laws in it.
     """
+    package = module.partition(".")[0]
+    verdicts = list(_left_out(package))
     objects = list(_objects(module))
-    if not objects:
-        raise UsageError(f"module {module}", f"holds no object that has laws; these are for each {', '.join(LAWS)}")
+    if not objects and not verdicts:
+        problem = f"holds no object that has laws; these are for each {', '.join(LAWS)}"
+        raise UsageError(f"module {module}", f"{problem}, with all parts of its interface, and for no class")
     tries = [(kind, name, value, law) for kind, name, value in objects for law in LAWS[kind]]
-    verdicts, package = [], module.partition(".")[0]
     with monitor.progress("checking", "laws") as tell:
         for done, (kind, name, value, law) in enumerate(tries, 1):
             problem = ""
@@ -54,6 +58,16 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     return verdicts
 
 
+def _left_out(package: str) -> Iterator[Verdict]:
+    """What entry points of a package name and cannot be used."""
+    for kind in REGISTRIES:
+        registry = registry_of(kind)
+        len(registry)  # loads them
+        for point, problem in registry.left_out.items():
+            if point.module.partition(".")[0] == package:
+                yield Verdict(kind, point.name, "Its entry point registers it.", problem)
+
+
 def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
     """Kind, name and value of all that has laws: what entry points of the package name, then the rest of the module.
 
@@ -62,11 +76,10 @@ def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
     package = module.partition(".")[0]
     names: set[tuple[str, int]] = set()
     for kind in LAWS:
+        left_out = registry_of(kind).left_out
         for point in entry_points(group=group_of(kind)):
-            if point.module.partition(".")[0] == package:
-                value = vars(_imported(point.module)).get(point.attr)
-                if value is None:
-                    raise UsageError(f"module {module}", f"has no {point.value}, which an entry point names")
+            if point.module.partition(".")[0] == package and point not in left_out:
+                value = point.load()
                 names.add((kind, id(value)))
                 yield kind, point.name, value
     for name, value in vars(_imported(module)).items():

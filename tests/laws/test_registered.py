@@ -7,14 +7,29 @@ from itertools import chain
 from operator import attrgetter
 
 import pytest
+import torch
 from torch.autograd.gradcheck import GradcheckError
 
+from aaplug.core.convolution import smoothed_by
+from aaplug.core.gaussians import Fusion
 from aaplug.core.rules import RULES_3DGS
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.laws import LAWS
-from aaplug.evaluation.laws.drawing import draws_what_the_reference_draws
-from aaplug.evaluation.laws.files import tells_scenes_apart
-from aaplug.evaluation.laws.filters import keeps_opacities_in_range
+from aaplug.evaluation.laws.drawing import (
+    alpha_is_exact,
+    draws_what_the_reference_draws,
+    ellipses_bound_it,
+    keeps_its_splats,
+)
+from aaplug.evaluation.laws.files import is_ideal_for_the_truth, reads_what_it_writes, tells_scenes_apart
+from aaplug.evaluation.laws.filters import (
+    has_gradients_in_the_world,
+    has_gradients_on_screen,
+    keeps_gaussians,
+    keeps_opacities_in_range,
+    keeps_splats,
+    never_shrinks_gaussians,
+)
 from aaplug.evaluation.laws.recipes import (
     EQUAL,
     OPACITY,
@@ -29,6 +44,7 @@ from aaplug.methods import RECIPES, SCREEN_FILTERS
 from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.rasterizers.tiled import Tiled
+from aaplug.system.errors import PlugInError
 from aaplug.system.registry import registry_of
 from tests.conftest import ALL_RASTERIZERS
 
@@ -77,6 +93,11 @@ class Spoiling:
     def __call__(self, splats, hw, background, pixel, compositor=None, rules=RULES_3DGS):
         splats.opacities.mul_(0.9)
         return Tiled()(splats, hw, (0.0, 0.0, 0.0), pixel, compositor, rules)
+
+
+class Bare(Spoiling):
+    def __call__(self, splats, hw, *args):
+        return torch.zeros(*hw, 3)
 
 
 class Raising:
@@ -156,6 +177,74 @@ def test_what_a_recipe_does_not_promise_does_not_hold(recipe):
         assert EQUAL < difference_to_training(recipe) < math.inf
 
 
-def test_a_filter_keeps_the_precision():
-    with pytest.raises(AssertionError, match=r"changes covs to torch.float64"):
-        keeps_opacities_in_range(lambda splats, *_: replace(splats, covs=splats.covs.double()))
+class Few(Point):
+    def bounding_ellipses(self, splats, rules):
+        return splats[:0]
+
+
+class Turned(Point):
+    def exact(self, splats, offsets):
+        return super().exact(splats, offsets).T
+
+
+class Doubling(Forgetful):
+    def write(self, path, parts, count, overwrite, options):
+        for part in parts:
+            part.means.mul_(2)
+
+
+class Plain(Forgetful):
+    write = staticmethod(ply.write)
+
+    def open_scene(self, *given):
+        return replace(ply.open_scene(*given), sh_degree=0)
+
+
+def blackens(image, truth):
+    image.numpy()[:] = 0.0  # torch counts no write
+    return float((image - truth).abs().mean())
+
+
+ALSO_BROKEN = {
+    "changes covs to torch.float64": (
+        keeps_opacities_in_range,
+        lambda splats, *_: replace(splats, covs=splats.covs.double()),
+    ),
+    "gives, called again, another opacities": (
+        keeps_splats,
+        lambda splats, *_: replace(splats, opacities=torch.rand_like(splats.opacities)),
+    ),
+    "gives, called again, other log_scales": (
+        keeps_gaussians,
+        lambda scene, *_: replace(
+            scene, log_scales=torch.rand_like(scene.log_scales), fused=(*scene.fused, Fusion("odd", {}))
+        ),
+    ),
+    "the gradient of opacities by opacities": (
+        has_gradients_on_screen,
+        lambda splats, *_: replace(splats, opacities=splats.opacities.detach()),
+    ),
+    "the gradient of log_scales by log_scales": (
+        has_gradients_in_the_world,
+        lambda scene, *_: replace(scene, log_scales=scene.log_scales.detach()),
+    ),
+    "there are 0 ellipses of 100 splats": (ellipses_bound_it, Few()),
+    "`alpha` and `exact` are of shapes": (alpha_is_exact, Turned()),
+    "should return a Render, got float32": (keeps_its_splats, Bare()),
+    "changes means": (reads_what_it_writes, Doubling()),
+    "says degree 0 and reads 1": (reads_what_it_writes, Plain()),
+    "changes an image": (is_ideal_for_the_truth, replace(METRICS["PSNR"], ideal=0.0, measure=blackens)),
+}
+
+
+@pytest.mark.parametrize("problem", ALSO_BROKEN)
+def test_a_broken_law_says_how(problem):
+    law, broken = ALSO_BROKEN[problem]
+    with pytest.raises((AssertionError, PlugInError), match=problem):
+        law(broken)
+
+
+def test_a_world_filter_may_leave_opacities_as_they_are():
+    never_shrinks_gaussians(
+        lambda scene, training: smoothed_by(scene, torch.zeros(len(scene), 1).to(scene.means), volume=False)
+    )

@@ -1,11 +1,13 @@
 """The table of laws, and scenes, cameras and splats at random to try them on."""
 
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.gradcheck import GradcheckError
 
 from aaplug.core.cameras import Camera, centred, look_at
 from aaplug.core.gaussians import Gaussians
@@ -37,10 +39,33 @@ def copies_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in vars(thing).items() if isinstance(value, Tensor)}
 
 
-def require_same(thing: Splats2D | Gaussians, before: dict[str, Tensor]) -> None:
-    """Raise AssertionError unless these tensors are as they were, to the bit."""
+def require_same(thing: Splats2D | Gaussians, before: dict[str, Tensor], problem: str = "changes") -> None:
+    """Raise AssertionError, with a problem of a column, unless these tensors are as they were, to the bit."""
     for name, value in before.items():
-        require(getattr(thing, name).equal(value), f"changes {name}")
+        require(getattr(thing, name).equal(value), f"{problem} {name}")
+
+
+def require_gradients(
+    function: Callable[..., Mapping[str, Any]], inputs: Mapping[str, Tensor], of: Sequence[str]
+) -> None:
+    """Raise AssertionError unless autograd's gradient of these outputs by the inputs is that of small differences.
+
+    function: takes the inputs in their order.
+    """
+
+    def outputs(*values: Tensor) -> tuple[Tensor, ...]:
+        found = function(*values)
+        attached = sum(0.0 * value.sum() for value in values)  # gradcheck passes by an output that is detached
+        return tuple(found[name] + attached for name in of)
+
+    try:
+        torch.autograd.gradcheck(outputs, [value.clone().requires_grad_() for value in inputs.values()])
+    except GradcheckError as error:
+        if not (found := re.search(r"output (\d+) with respect to input (\d+)", str(error))):
+            raise
+        output, by = of[int(found[1])], [*inputs][int(found[2])]
+        problem = f"the gradient of {output} by {by} is not that of small differences"
+        raise AssertionError(f"{problem}, or two calls differ") from error
 
 
 def make_camera(

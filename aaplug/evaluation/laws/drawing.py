@@ -19,6 +19,7 @@ from aaplug.methods.pixel_kernels.raster_rows import BLUE, RED, TILE, tile_centr
 from aaplug.rasterizers.reference import Reference, alphas
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.forward import STEP
+from aaplug.system.plug_ins import check_answer
 
 from .base import F64, copies_of, law_of, make_splats, require, require_same
 
@@ -56,7 +57,11 @@ def alpha_is_exact(pixel: PixelKernel) -> None:
             limits = Limits(*torch.tensor(Limits.by(rules)).unbind()) if compiling else Limits.by(rules)
             alpha = pixel.alpha(rows, _pixels(pixel, splats, corners, centres), limits)
         points = (corners[:, None] + centres).flatten(0, 1).double()
-        exact = pixel.exact(splats, points[:, None] - splats.means) * splats.opacities
+        exact = pixel.exact(splats, points[:, None] - splats.means)
+        shapes = (tuple(alpha.shape), tuple(exact.shape))
+        expected = (len(splats), len(corners), len(centres)), (len(points), len(splats))
+        require(shapes == expected, f"`alpha` and `exact` are of shapes {shapes}, not {expected}")
+        exact = exact * splats.opacities
         exact = exact.T.unflatten(1, alpha.shape[1:])
         expected = torch.where(exact >= rules.min_alpha, exact, 0.0)
         compared = (exact / rules.min_alpha - 1).abs() > CUTOFF_BAND
@@ -96,7 +101,9 @@ def rows_hold_colours(pixel: PixelKernel) -> None:
 
 def require_bounds(pixel: PixelKernel, splats: Splats2D, rules: Rules) -> None:
     """Raise AssertionError where a pixel is drawn that lies outside of its splat's bounding ellipse."""
-    ellipses = pixel.bounding_ellipses(splats, rules) or splats
+    bounds = pixel.bounding_ellipses(splats, rules)
+    ellipses = splats if bounds is None else bounds
+    require(len(ellipses) == len(splats), f"there are {len(ellipses)} ellipses of {len(splats)} splats")
     points = torch.cartesian_prod(*(torch.arange(-20, side + 20, 2.3, dtype=F64) for side in (64, 48)))
     meets_horizon = ellipses.opacities == 0  # such discs are not drawn
     drawn = (alphas(splats, points, pixel, rules) >= rules.min_alpha) & ~meets_horizon
@@ -163,6 +170,7 @@ def draws_what_the_reference_draws(rasterizer: Rasterizer) -> None:
             splats = replace(splats, ray_slopes=tilt * (splats.means.roll(1, dims=0) / max(hw)).cos())
         splats = splats[torch.randperm(150, generator=torch.Generator().manual_seed(2))]
         image, exact = (draw(splats, hw, SKY, POINT, rules=rules) for draw in (rasterizer, Reference()))
+        check_answer("`__call__`", image, Render)
         require(image.rgb.shape == (*hw, 3) and image.alpha.shape == hw, f"an image of {hw} is of another shape")
         require_same_image(image, exact)
         require((image.alpha.double() - exact.alpha).abs().median() < SAME, "alpha differs")
@@ -174,6 +182,7 @@ def keeps_its_splats(rasterizer: Rasterizer) -> None:
     splats = make_splats(300, (60, 70), seed=3)
     before = copies_of(splats)
     first, second = (rasterizer(splats, (60, 70), SKY, POINT) for _ in range(2))
+    check_answer("`__call__`", first, Render)
     require_same(splats, before)
     require(first.rgb.equal(second.rgb) and first.alpha.equal(second.alpha), "two runs differ")
     empty = rasterizer(splats[:0], HW, SKY, POINT)

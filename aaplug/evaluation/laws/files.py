@@ -16,25 +16,30 @@ from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.locks import OUR_PREFIX
 
-from .base import law_of, make_scene, require
+from .base import copies_of, law_of, make_scene, require, require_same
 
 COUNT = 20  # Gaussians
 HEADS = (b"", b"\0" * 64, b"\xff" * 64, b"ply\n" + b"comment " * 8, b"PK\3\4" + bytes(60), b"{" * 64)
 
 
+def _noise(seed: int) -> Tensor:
+    return torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(seed))
+
+
 @law_of("metric")
 def is_ideal_for_the_truth(metric: Metric) -> None:
-    """`measure` gives `ideal` or None for the truth itself, a worse value for noise, and the same value again."""
+    """`measure` gives `ideal` or None for the truth, a worse value for noise, the same again, and keeps both images."""
     if metric.measure is None:
         return
-    truth = quantised(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
-    noise = quantised(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(1)))
+    truth, noise = quantised(_noise(0)), quantised(_noise(1))
     try:
         metric.measure(truth, truth)
     except UsageError:  # it needs files that are not here
         return
     ideal, value, again = (metric.compare(image, truth) for image in (truth, noise, noise))
     require(value == again, f"gives {value}, then {again}")
+    kept = truth.equal(quantised(_noise(0))) and noise.equal(quantised(_noise(1)))
+    require(kept, "changes an image")
     close = ideal is None or math.isclose(ideal, metric.ideal, abs_tol=1e-4)
     require(close, f"the truth has {ideal} instead of {metric.ideal}")
     worse = value is None or ideal is None or metric.loss(value) > metric.loss(ideal)
@@ -92,19 +97,24 @@ def tells_scenes_apart(format: SceneFormat) -> None:
 
 @law_of("scene format")
 def reads_what_it_writes(format: SceneFormat) -> None:
-    """It reads what it writes, with as many Gaussians, at their places to 1 %, in any order."""
+    """It reads what it writes and keeps it, with as many Gaussians, at their places to 1 %, in any order."""
     if not isinstance(format, WritableFormat):
         return
     scene = make_scene(COUNT)
+    before = copies_of(scene)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{format.name}"
         format.write(path, [scene[:12], scene[12:]], COUNT, False, SceneFileOptions())
+        require_same(scene, before)
         read_as = getattr(format, "read_as", None)  # another format, which reads both
         reader = format if read_as is None else SCENE_FORMATS[read_as]
         require(reader.sniff(path, path.read_bytes()[:64]), "does not take its own file")
         opened = format.open_scene(path, SceneFileOptions())
         require(opened.count == COUNT, f"wrote {COUNT} Gaussians and reads {opened.count}")
-        means = opened.load(0, COUNT).means.float()
+        loaded = opened.load(0, COUNT)
+        degrees = opened.sh_degree, loaded.sh_degree
+        require(degrees[0] == degrees[1], f"says degree {degrees[0]} and reads {degrees[1]}")
+        means = loaded.means.float()
         nearest = torch.cdist(means, scene.means).argmin(dim=1)
         require(len(nearest.unique()) == COUNT, "Gaussians are doubled or lost")
         torch.testing.assert_close(means, scene.means[nearest], rtol=0.01, atol=0.01)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.system.plug_ins import check_answer
 
-from .base import F64, copies_of, law_of, make_camera, make_scene, make_splats, require, require_same
+from .base import F64, copies_of, law_of, make_camera, make_scene, make_splats, require, require_gradients, require_same
 
 N = 40  # Gaussians
 EYES = [(0.0, -4.0, 0.0), (3.0, -4.0, 1.0), (-2.0, -6.0, 0.5)]
@@ -78,7 +78,7 @@ def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.
 
 @law_of("screen filter")
 def keeps_splats(screen: ScreenFilter) -> None:
-    """It keeps its input, and returns splats with other covariances and opacities alone."""
+    """It keeps its input, and returns splats with other covariances and opacities alone, the same again."""
     for view, training in SITUATIONS.values():
         splats = shade(project(SCENE, view), SCENE, view)
         before = copies_of(splats)
@@ -87,6 +87,7 @@ def keeps_splats(screen: ScreenFilter) -> None:
         require_same(splats, before)
         require(len(filtered) == len(splats), "leaves splats out")
         require_same(filtered, {name: before[name] for name in ("means", "depths", "sources", "rgb")})
+        require_same(screen(splats, view, training), copies_of(filtered), "gives, called again, another")
 
 
 @law_of("screen filter")
@@ -133,16 +134,15 @@ def keeps_huge_splats(screen: ScreenFilter) -> None:
 def has_gradients_on_screen(screen: ScreenFilter) -> None:
     """Its gradient is that of its formula."""
     splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
-    inputs = [x.clone().requires_grad_() for x in (splats.covs, splats.dets, splats.depths, splats.opacities)]
+    inputs = {name: getattr(splats, name) for name in ("covs", "dets", "depths", "opacities")}
     # not at the training size, where the range of rates ends at the view itself: that is a kink
     for view, training in list(SITUATIONS.values())[1:]:
 
-        def filtered(covs: Tensor, dets: Tensor, depths: Tensor, opacities: Tensor) -> tuple[Tensor, ...]:
-            given = replace(splats, covs=covs, dets=dets, depths=depths, opacities=opacities)
-            out = screen(given, view, training)  # noqa: B023 (called in the same turn)
-            return out.covs, out.dets, out.opacities
+        def filtered(*values: Tensor) -> dict[str, Any]:
+            given = replace(splats, **dict(zip(inputs, values, strict=True)))
+            return vars(screen(given, view, training))  # noqa: B023 (called in the same turn)
 
-        torch.autograd.gradcheck(filtered, inputs)
+        require_gradients(filtered, inputs, ("covs", "dets", "opacities"))
 
 
 def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) -> Gaussians:
@@ -153,7 +153,7 @@ def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) 
 
 @law_of("world filter")
 def keeps_gaussians(world: WorldFilter) -> None:
-    """It keeps its input, returns Gaussians with other scales and opacities alone, and records itself in `fused`."""
+    """It keeps its input, records itself in `fused`, and else changes scales and opacities alone, the same again."""
     scene = world_scene()
     before, training = copies_of(scene), TrainingViews.of(scene, CAMERAS)
     once = world(scene, training)
@@ -163,6 +163,7 @@ def keeps_gaussians(world: WorldFilter) -> None:
     require(once.log_scales.shape == scene.log_scales.shape, "does not return as many Gaussians")
     require_same(once, {name: before[name] for name in ("means", "quats", "sh")})
     require(len(once.fused) == 1 and once.fused[0].method, f"records {once.fused} instead of itself")
+    require_same(world(scene, training), copies_of(once), "gives, called again, other")
     twice = world(replace(once, filter_3d=scene.filter_3d), training)
     require(twice.fused[0] == once.fused[0] and len(twice.fused) == 2, "drops earlier records from `fused`")
 
@@ -190,8 +191,9 @@ def never_shrinks_gaussians(world: WorldFilter) -> None:
         require((filtered.log_scales >= scene.log_scales).all(), f"{name}: a scale is smaller than it was")
         finite = (filtered.log_scales < torch.inf).all() and filtered.logit_opacities.isfinite().all()
         require(finite, f"{name}: values are not finite")
-        inside = filtered.opacities.min() > 0 and filtered.opacities.max() < 1
-        require(inside or name != "scales as usual", "opacities reach 0 or 1")
+        inside = (filtered.opacities > 0) & (filtered.opacities < 1)
+        kept = filtered.logit_opacities == scene.logit_opacities  # 1 where it was 1
+        require((inside | kept).all() or name != "scales as usual", "opacities reach 0 or 1")
 
 
 @law_of("world filter")
@@ -200,11 +202,11 @@ def has_gradients_in_the_world(world: WorldFilter) -> None:
     scene = world_scene()[torch.arange(2)]
     training = TrainingViews.of(scene, CAMERAS)
 
-    def filtered(log_scales: Tensor, logit_opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
-        given = replace(scene, log_scales=log_scales, logit_opacities=logit_opacities, filter_3d=filter_3d)
-        out = world(given, training)
-        return out.log_scales, out.logit_opacities
-
     assert scene.filter_3d is not None
-    inputs = scene.log_scales, scene.logit_opacities - 2, scene.filter_3d
-    torch.autograd.gradcheck(filtered, [x.clone().requires_grad_() for x in inputs])
+    logits = scene.logit_opacities - 2
+    inputs = {"log_scales": scene.log_scales, "logit_opacities": logits, "filter_3d": scene.filter_3d}
+
+    def filtered(*values: Tensor) -> dict[str, Any]:
+        return vars(world(replace(scene, **dict(zip(inputs, values, strict=True))), training))
+
+    require_gradients(filtered, inputs, ("log_scales", "logit_opacities"))
