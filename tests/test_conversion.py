@@ -139,3 +139,7 @@ def test_discs_are_smoothed_within_their_planes_and_stay_discs(cameras, tmp_path
     for options in ({"form": "matched-energy"}, {"viewer": "spark"}):
         with pytest.raises(UsageError, match=r"2D Gaussians.*form mip-splatting smooths them"):
             aaplug.convert(scene, CameraSet(tuple(cameras), ()), None, min_seen=0.0, **options)
+
+
+def test_a_format_that_no_viewer_opens_is_told():
+    assert VIEWERS["mip"].advice("balls", "scene.balls") == "no viewer is known to open scene.balls"

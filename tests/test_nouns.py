@@ -16,6 +16,7 @@ from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation import METRICS
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.scenes import read_scene, scene_of, write_scene
 from aaplug.methods import RECIPES
@@ -64,6 +65,10 @@ def test_a_printed_scene_says_what_it_is_and_leaves_out_what_its_writer_needs(tm
         assert "scene.ply" in printed
         assert "convention=" in printed
         assert "f_dc_0" not in printed
+
+
+def test_a_printed_registry_lists_its_names():
+    assert repr(METRICS).startswith("Registry(metric: PSNR, SSIM, LPIPS")
 
 
 def test_what_is_printed_of_cameras_and_of_a_renderer_does_not_grow_with_them():

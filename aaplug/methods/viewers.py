@@ -105,6 +105,8 @@ class Viewer:
             if alike:
                 return f"open {file} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
             fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
+            if not fitting:
+                return f"no viewer is known to open {file}"
             hint = f"--for {listing(fitting)} writes one for its own rule"
             if others:
                 hint = f"--for {others[0].name} writes one that {others[0].program} opens"

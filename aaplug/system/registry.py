@@ -96,6 +96,9 @@ class Registry(Mapping[str, T]):
     def __len__(self) -> int:
         return len(list(iter(self)))
 
+    def __repr__(self) -> str:
+        return f"Registry({self.kind}: {', '.join(self.names)})"
+
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         """A registry is its process's own; a copy is that of the process that makes it."""
         return _at, (REGISTRIES[self.kind],)
