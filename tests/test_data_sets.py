@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import aaplug
-from aaplug.evaluation.data_sets import DATA_SETS, PUBLISHED, find_scenes
+from aaplug.evaluation.data_sets import DATA_SETS, PUBLISHED, Paper, find_scenes
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.scene import MODEL_SCENE as MODEL
 from aaplug.system.errors import FormatError, UsageError
@@ -88,6 +88,13 @@ def test_the_papers_table(whole):
     assert "published" not in latex  # other scales than the papers'
     assert r"{\scriptsize $\pm$ 0.00}" in latex
     assert len(json.loads(Path("out", "batch.json").read_text())["mean_over"]) == 8
+
+
+def test_names_that_mean_something_to_latex_are_escaped():
+    assert (
+        r"5\% \& a\_b\# & 1.0 {\scriptsize $\pm$ 0.1} \\"
+        in Paper("", ["", "1"], [["5% & a_b#", "1.0 ± 0.1"]]).as_latex()
+    )
 
 
 def test_the_papers_figures_stand_above_ours_at_their_scales(whole):

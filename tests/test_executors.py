@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
+from threading import Lock
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -26,7 +27,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system import groups
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, OutputError, UsageError, within_memory
-from aaplug.system.executors import Processes, Threads, given_threads, torch_threads
+from aaplug.system.executors import Processes, Threads, given_threads, save, torch_threads
 from aaplug.system.monitor import Monitor
 from tests.conftest import ROOT, SAMPLE, exit_code, files_of_at_most, make_camera, make_scene, run_python
 from tests.work import refuse_three
@@ -38,6 +39,14 @@ def test_what_a_notebook_defines_is_done_without_processes(monkeypatch):
     exec("import os\ndef where(item): return item, os.getpid()", vars(notebook))
     monkeypatch.setitem(sys.modules, "__main__", notebook)
     assert [*Processes(2).map(notebook.where, range(3))] == [(item, os.getpid()) for item in range(3)]
+
+
+@pytest.mark.parametrize("held", [lambda: 0, Lock()], ids=["lambda", "lock"])
+def test_what_cannot_be_pickled_is_done_without_processes(held, tmp_path):
+    work = partial(lambda held, item: (item, os.getpid()), held)
+    assert [*Processes(2).map(work, range(3))] == [(item, os.getpid()) for item in range(3)]
+    with pytest.raises(UsageError, match=r"^workers: cannot be given .* such as a lambda: "):
+        save(work, tmp_path / "work.pt")
 
 
 @pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)

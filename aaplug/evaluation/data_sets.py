@@ -1,5 +1,6 @@
 """Sets of scenes that papers report on: how their folders lie, and a table as the papers print it."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +119,7 @@ class Paper(NamedTuple):
         lines = [f"% {self.title}", rf"\begin{{tabular}}{{l{'c' * (len(self.headings) - 1)}}}", r"\toprule"]
         lines += [" & ".join(self.headings).replace("×", r"$\times$") + r" \\", r"\midrule"]
         for row in self.rows:
-            name, *cells = (cell.replace("_", r"\_") for cell in row)
+            name, *cells = (re.sub(r"[&%$#_{}]", r"\\\g<0>", cell) for cell in row)
             shown = [cell.replace(" ± ", r" {\scriptsize $\pm$ ") + "}" * ("±" in cell) for cell in cells]
             lines.append(" & ".join([name, *shown]) + r" \\")
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"

@@ -79,6 +79,7 @@ class Cluster:
             ClusterError: the scheduler or all workers are lost, or one has another version or does not see the folder.
             UsageError: the workers of one item died again and again.
             OutputError: there is no room for the file of `work`.
+            OfThisProcessError: `work` cannot be pickled.
         """
         self._last_look, self._last_worker = -math.inf, time.monotonic()
         with scratch(self.folder and str(self.folder.absolute())) as folder, self.worded():

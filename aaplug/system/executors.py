@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -74,8 +75,8 @@ class Processes:
 
     `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
     through pipes.  A script whose own classes or functions are part of `work` is imported by each process, so it needs
-    `if __name__ == "__main__":` around its calls.  What a notebook defines no other process can import, so that such
-    work is done in this one.
+    `if __name__ == "__main__":` around its calls.  What a notebook or a function defines no other process can import,
+    so that such work is done in this one.
 
     ordered: true for results in the order of the items, false for results as they finish.
     """
@@ -91,9 +92,13 @@ class Processes:
             OutputError: there is no room for the file of `work`.
         """
         with scratch() as folder:
-            save(work, folder / WORK_FILE_NAME)
-            needs = needs_script(folder / WORK_FILE_NAME)
-            if needs and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or ""):
+            try:
+                save(work, folder / WORK_FILE_NAME)
+                needs = needs_script(folder / WORK_FILE_NAME)
+                alone = needs and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or "")
+            except OfThisProcessError:
+                needs = alone = True
+            if alone:
                 yield from map(work, items)
                 return
             track_quietly()
@@ -213,8 +218,17 @@ def _next(waiting: deque[Any], ordered: bool) -> Any:
     return future.result()
 
 
+class OfThisProcessError(UsageError):
+    """Something that no other process can import, such as a lambda."""
+
+
 def save(work: object, path: Path) -> None:
-    """Write the function of the workers; raises OutputError if there is no room for it."""
+    """Write the function of the workers.
+
+    Raises:
+        OutputError: there is no room for it.
+        OfThisProcessError: it cannot be pickled.
+    """
     try:
         with path.open("wb") as stream:
             torch.save(work, stream)
@@ -222,6 +236,9 @@ def save(work: object, path: Path) -> None:
         if cause := of_system(error):
             raise OutputError(path, f"cannot be written: {reason(cause)}") from error
         raise
+    except (PicklingError, AttributeError, TypeError) as error:
+        problem = f"cannot be given what no module holds under its name, such as a lambda: {error}"
+        raise OfThisProcessError("workers", problem) from error
 
 
 def needs_script(path: Path) -> bool:
