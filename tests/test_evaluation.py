@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -31,6 +32,7 @@ from aaplug.evaluation.results import (
 )
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, ViewTruth, back_projected
 from aaplug.io.images import read_image
+from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING
 from aaplug.methods import RECIPES
 from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers import RASTERIZERS
@@ -152,6 +154,15 @@ def test_evaluations_of_every_kernel_and_compositor_are_counted_and_fewer_where_
 def test_a_rasterizer_that_does_not_count_has_no_evaluations(look, views):
     slow = replace(look, rasterizer=RASTERIZERS["reference"])
     assert evaluate(task(slow, views[:1], scales=(0.5,))).measurements[0].evaluations is None
+
+
+def test_a_compositor_without_kernels_has_no_evaluations(look, views):
+    def tiles(rows, window, order, first, counts, centres, *_):
+        return torch.zeros(4, *centres[0].shape)
+
+    plain = SimpleNamespace(name="plain", rows=GAUSSIAN_BLENDING.rows, tiles=tiles, exact=GAUSSIAN_BLENDING.exact)
+    recipe = replace(RECIPES["classic"], compositor=plain)
+    assert TimedRenderer(replace(look, recipe=recipe))(views[0].scaled(0.5)).evaluations is None
 
 
 FIGURES = (CONSISTENCY, ENERGY, FLICKER)

@@ -50,7 +50,7 @@ class TimedImage:
 
 
 class TimedRenderer:
-    """A renderer that times its images and counts their splat-pixel evaluations where its rasterizer can."""
+    """A renderer that times its images and counts their splat-pixel evaluations where rasterizer and kernels can."""
 
     def __init__(self, renderer: Renderer):
         self._evaluations: list[int] | None = None
@@ -68,7 +68,8 @@ class TimedRenderer:
         with torch.no_grad():
             rgb, alpha = renderer(camera)
         seconds = time.perf_counter() - started
-        evaluations = None if self._evaluations is None else sum(self._evaluations)
+        without_kernels = renderer.recipe.compositor is not None and not self._evaluations
+        evaluations = None if self._evaluations is None or without_kernels else sum(self._evaluations)
         samples, background = renderer.samples(camera), renderer.background
         return TimedImage(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
 
