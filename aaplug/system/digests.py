@@ -2,8 +2,14 @@
 
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import partial
 from os import PathLike
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
 
 from aaplug.system.errors import FormatError, reason
 
@@ -27,5 +33,48 @@ def digest_of_files(paths: Iterable[str | PathLike[str]]) -> str:
 
 
 def digest_of_values(value: object) -> str:
-    """Hash of dataclasses, names and numbers by their text; functions in it count by name, not by address."""
-    return hashlib.sha256(MEMORY_ADDRESS.sub("", repr(value)).encode()).hexdigest()
+    """Hash of dataclasses, names and numbers by their text; functions in it count by name, not by address.
+
+    Lambdas, and what a function defines, share names, and count by their code and what that holds.  Objects whose text
+    does not say all count by their fields, and tensors by their numbers.
+    """
+    digest = hashlib.sha256(_text(value))
+    for text in _texts(value, frozenset()):
+        digest.update(text)
+    return digest.hexdigest()
+
+
+def _text(value: object) -> bytes:
+    return MEMORY_ADDRESS.sub("", repr(value)).encode()
+
+
+def _texts(value: Any, above: frozenset[int]) -> Iterator[bytes]:
+    """What a value is made of, which its text may not say.  above: `id` of what it is a part of."""
+    parts: Iterable[Any] = ()
+    if id(value) in above or isinstance(value, type | ModuleType):
+        return
+    if isinstance(value, Mapping):
+        parts = value.values()
+    elif isinstance(value, list | tuple):
+        parts = value
+    elif isinstance(value, set | frozenset):
+        parts = sorted(value, key=_text)
+    elif isinstance(value, partial):
+        parts = value.func, value.args, value.keywords
+    elif isinstance(value, CodeType):
+        yield value.co_code + _text(value.co_names)
+        parts = value.co_consts
+    elif isinstance(value, FunctionType) and "<" in value.__qualname__:
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        parts = value.__code__, value.__defaults__, value.__kwdefaults__, cells
+    elif is_dataclass(value):
+        parts = [getattr(value, field.name) for field in fields(value)]
+    elif hasattr(value, "__array__"):
+        array: Any = value
+        yield np.ascontiguousarray(array.detach().cpu() if hasattr(array, "detach") else array).tobytes()
+    elif hasattr(value, "__dict__") and not isinstance(value, FunctionType):
+        parts = vars(value).values()
+    else:
+        yield _text(value)
+    for part in parts:
+        yield from _texts(part, above | {id(value)})
