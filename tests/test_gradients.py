@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
+import aaplug
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.methods import RECIPES
@@ -81,3 +82,15 @@ def test_gradients_are_finite_differences(recipe):
     ends = [loss(chosen, {n: fixed[n] + sign * steps[n] for n in NAMES}).item() for sign in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * STEP)
     assert slope == pytest.approx(len(NAMES) * least, rel=RELATIVE / len(NAMES)), slopes
+
+
+@pytest.mark.parametrize(
+    "mode", [torch.enable_grad, torch.no_grad, torch.inference_mode], ids=lambda mode: mode.__name__
+)
+def test_verbs_work_in_every_mode_of_autograd_and_on_a_scene_that_it_follows(mode, recwarn):
+    with mode():
+        scene = SCENE.to(torch.float32)
+        scene = replace(scene, **{name: 1 * column.clone().requires_grad_() for name, column in scene.columns.items()})
+        level = aaplug.lod(scene, CameraSet((CAMERA,), (CAMERA,)), levels=1, steps=1, rasterizer="eager")[-1]
+    assert not level.scene.means.requires_grad
+    assert not [each for each in recwarn if "requires_grad" in str(each.message)]

@@ -6,11 +6,15 @@ keywords of the verb, and so do `help` and the API's pages.
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial, wraps
 from os import PathLike
 from types import NoneType
 from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
 
+import torch
+
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import AnyPath, check_name
 from aaplug.io.scenes import SceneLike
 from aaplug.options.base import Options, documented
@@ -81,6 +85,15 @@ def compares(
     return partial(_verb, options)
 
 
+def _constant(value: Any) -> Any:
+    """The argument of a verb, without what autograd knows of Gaussians."""
+    if isinstance(value, Gaussians) and any(column.requires_grad for column in value.columns.values()):
+        return replace(value, **{name: column.detach() for name, column in value.columns.items()})
+    if isinstance(value, Mapping):
+        return {name: _constant(each) for name, each in value.items()}
+    return [*map(_constant, value)] if isinstance(value, list | tuple) else value
+
+
 def _verb(options: Any, body: Callable[..., Any]) -> Any:
     *given, last = inspect.signature(body).parameters.values()
     assert last.name == "options"
@@ -93,9 +106,12 @@ def _verb(options: Any, body: Callable[..., Any]) -> Any:
         own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
         bound = inputs.bind(*args, **own)
         bound.apply_defaults()
+        for name in bound.arguments.keys() & {"scene", "scenes"}:
+            bound.arguments[name] = _constant(bound.arguments[name])
         if isinstance(output := bound.arguments.get("output"), str | PathLike):
             check_name(output)
-        with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
+        # where more threads pay, and are free, `on_free_cores` takes them
+        with torch.inference_mode(False), torch.enable_grad(), torch_threads(1, given_threads()):
             for name in keywords.keys() - hints:
                 raise UsageError(name, f"is no option here{did_you_mean(name, hints)}")
             return body_checked(*bound.args, options(**keywords))
