@@ -39,16 +39,15 @@ def main(gaussians: int = 100_000, side: int = 800, rounds: int = 5) -> None:
         columns = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
         leaves = [column.clone().requires_grad_() for column in columns]
         intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        views = camera.cam_from_world.float()[None], intrinsics[None], camera.width, camera.height
+        view = camera.cam_from_world.float()[None], intrinsics[None], camera.width, camera.height
+        draw = partial(aaplug.gsplat.rasterization, *leaves, *view, sh_degree=scene.sh_degree, packed=False)
 
-        def step(call: str, leaves: list[torch.Tensor], views: tuple[Any, ...], degree: int) -> None:
-            rgb, _, _ = aaplug.gsplat.rasterization(*leaves, *views, sh_degree=degree, packed=False, **CALLS[call])
+        def step(call: str, draw: Callable[..., tuple[Any, ...]]) -> None:
+            rgb = draw(**CALLS[call])[0]
             read = rgb if "depth" in call or "both" in call else rgb[..., :3]
             read.square().sum().backward()
 
-        works: dict[str, Callable[[], object]] = {
-            call: partial(step, call, leaves, views, scene.sh_degree) for call in CALLS
-        }
+        works: dict[str, Callable[[], object]] = {call: partial(step, call, draw) for call in CALLS}
         times = timed(works, rounds)
         heading(f"{name}, {camera.width}x{camera.height}, forward + backward", "call", "ms", f"over {PLAIN}")
         for call, seconds in times.items():
