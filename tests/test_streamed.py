@@ -340,14 +340,18 @@ def test_parts_of_an_earlier_run_are_removed_and_nothing_else(tmp_path, small_le
     assert list(mine.parent.iterdir()) == [mine]
 
 
-def test_a_page_has_the_viewer_beside_it(tmp_path):
+def test_a_page_has_the_viewer_beside_it(tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="does not hold playcanvas/build"):
         made(tmp_path / "out", "sog", page=tmp_path)
     assert not (tmp_path / "out").exists()
     program = tmp_path / "modules" / "playcanvas" / "build" / "playcanvas.min.mjs"
     program.parent.mkdir(parents=True)
     program.write_text("export {};")
-    made(tmp_path / "out", "sog", page=tmp_path / "modules")
+    with monkeypatch.context() as patch:
+        patch.setattr("aaplug.io.streamed.write_page", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            made(tmp_path / "out", "sog", page=tmp_path / "modules")
+    made(tmp_path / "out", "sog", page=tmp_path / "modules", resume=True)  # it is not complete without its page
     page = (tmp_path / "out" / "index.html").read_text()
     assert (tmp_path / "out" / "viewer" / program.name).read_text() == program.read_text()
     assert f"./viewer/{program.name}" in page

@@ -297,9 +297,9 @@ def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]
             rates_of_levels = [level.rate for level in levels]
             how = (rates_of_levels, maker.look, maker.views, options.tuning, maker.viewer, maker.job.monitor)
             tree = tree._replace(scene=refine_tree(tree.scene, tree.parents, *how))
-    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree)
-    if options.page is not None:
+    if options.page is not None:  # before the index, which says that all is there
         streamed.write_page(folder, to, Path(options.page))
+    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree)
     maker.job.monitor.say(f"set the viewer by {folder / streamed.SETTINGS}: {json.dumps(settings)}")
     streamed.remove_parts(earlier - streamed.part_folders(folder, to), to)
     if to == "rad":
