@@ -96,13 +96,16 @@ class Cluster:
         """Count the workers now and then, and tell of lost ones.
 
         Raises:
-            ClusterError: the scheduler has gone, or all workers for long.
+            ClusterError: the scheduler has gone, or all workers for long, or it does not answer.
         """
         if self.client.status != "running":
             raise self._lost()
         if time.monotonic() - self._last_look < LOOK_SECONDS:
             return
-        present: dict[str, int] = self.client.nthreads()  # pyright: ignore[reportAssignmentType] (by address)
+        try:
+            present = cast(dict[str, int], self.client.nthreads(callback_timeout=ABSENT_SECONDS))  # by address
+        except TimeoutError as error:
+            raise ClusterError(f"scheduler {self.name}", f"has not answered for {ABSENT_SECONDS:.0f} s") from error
         if lost := self._workers - present.keys():
             these = f"{len(lost)} of {counted(len(self._workers), 'worker')} ({listing(sorted(lost))})"
             self.monitor.say(f"lost {these}; others do again what was begun there")
