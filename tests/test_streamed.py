@@ -357,7 +357,7 @@ def test_a_page_has_the_viewer_beside_it(tmp_path, monkeypatch):
     assert f"./viewer/{program.name}" in page
     assert "http" not in page
     assert "width=device-width" in page  # else a phone lays it out for 980 px
-    assert (tmp_path / "out" / "orbit.js").is_file()
+    assert all((tmp_path / "out" / script).is_file() for script in ("orbit.js", "problems.js"))
     view = json.loads((tmp_path / "out" / "settings.json").read_text())["view"]
     assert view["up"] == pytest.approx(up_of(CAMERAS).tolist())
     assert math.dist(view["centre"], SCENE.means.median(dim=0).values.tolist()) < view["radius"]

@@ -360,6 +360,20 @@ def test_a_browser_leaves_fingers_to_a_page_of_streamed_levels(browser, name):
     page.close()
 
 
+def test_a_page_of_streamed_levels_says_why_it_shows_none(browser, tmp_path):
+    for name in ("index.html", "problems.js"):
+        source = files("aaplug.io.stream_pages").joinpath(name.replace("index", "3dtiles"))
+        (tmp_path / name).write_bytes(source.read_bytes())
+    page = browser.new_page()
+    page.goto((tmp_path / "index.html").as_uri())
+    assert "run “python -m http.server” in this folder" in page.locator("p").inner_text()
+    page.close()
+    page, script = browser.new_page(), (tmp_path / "problems.js").read_text()
+    page.set_content(f"<canvas></canvas><script>{script}</script><script src=nowhere:viewer.js></script>")
+    assert page.locator("p").inner_text() == "nowhere:viewer.js cannot be read"
+    page.close()
+
+
 def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
     """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
     script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()

@@ -55,7 +55,8 @@ THREE = (
     "three/examples/jsm/postprocessing/Pass.js",
 )
 TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
-SETTINGS, PAGE, ORBIT = "settings.json", "index.html", "orbit.js"
+SETTINGS, PAGE = "settings.json", "index.html"
+PAGE_SCRIPTS = ("orbit.js", "problems.js")
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 FACTS = 7  # numbers that tell of a part: its Gaussians, and the smallest and largest coordinates
 MAKE_AGAIN = "`aaplug lod --overwrite` makes all levels again"
@@ -263,7 +264,7 @@ def programs_of(name: StreamName, modules: Path) -> list[Path]:
 
 
 def write_page(folder: Path, name: StreamName, modules: Path) -> None:
-    """Write index.html and orbit.js, which open the levels, and the viewer's program into viewer/ beside them.
+    """Write index.html and its scripts, which open the levels, and the viewer's program into viewer/ beside them.
 
     A browser reads them from a server, such as `python -m http.server`; nothing is fetched from elsewhere.
     """
@@ -276,7 +277,7 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
                 shutil.copy(program, viewer)
     except OSError as error:
         raise OutputError(viewer, f"cannot be written: {reason(error)}") from error
-    for file, source in {ORBIT: ORBIT, PAGE: f"{name}.html"}.items():
+    for file, source in [*((script, script) for script in PAGE_SCRIPTS), (PAGE, f"{name}.html")]:
         write_file(folder / file, files(stream_pages).joinpath(source).read_bytes(), overwrite=True)
 
 
