@@ -11,7 +11,7 @@ import torch
 import aaplug
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, CameraSet, Exposure
-from aaplug.core.exposures import CELL_SHARE, cells, lattice, opening, sample_cameras, spread
+from aaplug.core.exposures import cells, lattice, opening, sample_cameras, spread
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
@@ -110,15 +110,22 @@ def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
 
 
 def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():
+    """Splats take half of them and, where their paths are longer than four of their widths, less."""
     splats = project(make_scene(30), VIEW)
+    splats = replace(splats, covs=splats.covs * torch.logspace(0, -6, len(splats))[:, None])
+
+    def share(path: torch.Tensor) -> torch.Tensor:
+        ratio = (splats.covs[:, ::2].sum(dim=1) / path[:, ::2].sum(dim=1)).sqrt().double()
+        assert 0 < int((ratio < 1 / 4).sum()) < len(ratio)
+        return torch.where(ratio < 1 / 4, 2 * ratio, 0.5)[:, None]
+
     round_cells, whole = (cells(splats, exposed(APERTURE, None, n)).double() for n in (16, 1))
     disc = spread(splats, exposed(APERTURE)).double()
-    assert torch.allclose(whole, CELL_SHARE * disc, rtol=1e-3, atol=1e-6)
-    assert torch.allclose(round_cells, CELL_SHARE * disc / 16, rtol=1e-3, atol=1e-6)
+    assert torch.allclose(whole, share(disc) * disc, rtol=1e-3, atol=1e-6)
+    assert torch.allclose(round_cells, share(disc) * disc / 16, rtol=1e-3, atol=1e-6)
     line = spread(splats, exposed(None, (VIEW, MOVED))).double()
-    assert torch.allclose(
-        cells(splats, exposed(None, (VIEW, MOVED))).double(), CELL_SHARE * line / 256, rtol=0.02, atol=1e-3
-    )
+    along = cells(splats, exposed(None, (VIEW, MOVED))).double()
+    assert torch.allclose(along, share(line) * line / 256, rtol=0.02, atol=1e-3)
 
 
 def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(monkeypatch):

@@ -22,9 +22,9 @@ from aaplug.core.cameras import Aperture, Camera
 from aaplug.core.rules import NEAR
 from aaplug.core.splats import Splats2D
 
-# Of a cell's variance, what its splats are convolved with; measured.  Opaque splats hide each other, and a wider filter
-# adds the energies of those that are hidden too.
-CELL_SHARE = 0.5
+# Of a cell's variance, what its splats are convolved with: at most, and times a splat's width over its whole path's;
+# measured.  Opaque splats hide each other, and a wider filter adds the energies of those that are hidden too.
+MAX_CELL_SHARE, SHARE_PER_WIDTH = 0.5, 2.0
 DIMENSIONS = 5  # x and y in the pixel and in the lens, and time
 MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
 MAX_GENERATORS = 256  # lattices tried
@@ -48,6 +48,7 @@ def cells(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
     """Packed covariance in px² that one sample adds to each splat: of its path across the sample's cell.
 
     N samples that fill an ellipse of covariance Σ evenly have cells of covariance √det Σ / N; along a line, of λ / N².
+    Splats whose path is longer than four of their widths take less of it.
     """
     assert camera.exposure is not None
     xx, xy, yy = spread(splats, camera).unbind(dim=1)
@@ -56,8 +57,11 @@ def cells(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
     longer, shorter = middle + radius, (middle - radius).clamp(min=0.0)
     even = (longer * shorter).sqrt() / count
     along, across = torch.maximum(even, longer / count**2), torch.minimum(even, shorter)
-    mean, turn = (along + across) / 2, (along - across) / 2 / radius.clamp(min=torch.finfo(xx.dtype).tiny)
-    return CELL_SHARE * torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
+    tiny = torch.finfo(xx.dtype).tiny
+    mean, turn = (along + across) / 2, (along - across) / 2 / radius.clamp(min=tiny)
+    ratio = (splats.covs[:, 0] + splats.covs[:, 2]) / (2 * middle).clamp(min=tiny)
+    share = (SHARE_PER_WIDTH * ratio.clamp(min=tiny).sqrt()).clamp(max=MAX_CELL_SHARE)
+    return share[:, None] * torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
 
 
 def spread(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
