@@ -55,11 +55,6 @@ MAGNITUDE_MASK = 511  # 9 bits of a quaternion's component; the tenth is its sig
 MAX_OLD_GAUSSIANS, MAX_OLD_DEGREE = 10_000_000, 3  # accepted by readers of versions before 4 (nianticlabs/spz)
 MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
-# a quaternion times 1, i, j or k is the same Gaussian, turned by half about one of its own axes
-HALF_TURNED = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
-HALF_TURN_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
-MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
-POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
 # a quaternion times 1, i, j or k, by the component that is then w: the same Gaussian, turned by halves about its axes
 HALF_TURNED = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 HALF_TURN_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
