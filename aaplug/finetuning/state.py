@@ -28,13 +28,12 @@ from aaplug.io.atomic import replacing
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import AaplugError, FormatError, UsageError, printable
+from aaplug.system.errors import START_AGAIN, AaplugError, FormatError, UsageError, printable
 from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
 FORMAT, VERSION = "aaplug finetune", 8  # of a checkpoint
-ANEW = "start again with `overwrite`, not `resume`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +180,11 @@ def load(path: Path, job: TuningJob) -> State:
         version, expected = f"{content['format']} {content.get('version', '')}".strip(), f"{FORMAT} {VERSION}"
         if version != expected:
             problem = f"is a checkpoint of another version: expected {expected}, got {printable(version)}"
-            raise FormatError(path, f"{problem}; {ANEW}")
+            raise FormatError(path, f"{problem}; {START_AGAIN}")
         for key, value in job.facts.items():
             if (before := content["job"].get(key)) != value:
                 problem = f"is of another run: {key} changed from {printable(str(before))} to {value}"
-                raise UsageError(str(path), f"{problem}; repeat that run, or {ANEW}")
+                raise UsageError(str(path), f"{problem}; repeat that run, or {START_AGAIN}")
         return state_of(content["state"], job, content["good"])
     except AaplugError:
         raise

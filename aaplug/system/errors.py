@@ -15,6 +15,7 @@ from traceback import walk_tb
 from types import FrameType
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
+START_AGAIN = "start again with `overwrite`, not `resume`"  # where what is there cannot be continued
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")

@@ -62,7 +62,7 @@ class Registry(Mapping[str, T]):
         self.kind, self._type_at = kind, type_at
         self._built_in: dict[str, T | str] = dict(own)
         self._entries: dict[str, T] = {}  # loaded
-        self.left_out: dict[EntryPoint, str] = {}  # plug-ins that cannot be used, and why
+        self._left_out: dict[EntryPoint, str] = {}
         self._plug_ins_loaded = False
         self._loading = set[int]()  # threads that load plug-ins; no lock, as an import that waits for it would not end
 
@@ -95,6 +95,12 @@ class Registry(Mapping[str, T]):
 
     def __len__(self) -> int:
         return len(list(iter(self)))
+
+    @property
+    def left_out(self) -> Mapping[EntryPoint, str]:
+        """The plug-ins that cannot be used, and why."""
+        self._load_plug_ins()
+        return self._left_out
 
     def __repr__(self) -> str:
         return f"Registry({self.kind}: {', '.join(self.names)})"
@@ -163,7 +169,7 @@ class Registry(Mapping[str, T]):
                     raise UsageError(where, f"cannot be imported: {of_import(error, point.module)}") from error
                 self._add(point.name, value, where)
             except UsageError as error:
-                self.left_out[point] = error.problem
+                self._left_out[point] = error.problem
                 log.warning("%s; it is left out", error)
 
     def _add(self, name: str, value: T, where: str) -> None:

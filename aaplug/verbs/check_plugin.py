@@ -61,9 +61,7 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
 def _left_out(package: str) -> Iterator[Verdict]:
     """What entry points of a package name and cannot be used."""
     for kind in REGISTRIES:
-        registry = registry_of(kind)
-        len(registry)  # loads them
-        for point, problem in registry.left_out.items():
+        for point, problem in registry_of(kind).left_out.items():
             if point.module.partition(".")[0] == package:
                 yield Verdict(kind, point.name, "Its entry point registers it.", problem)
 

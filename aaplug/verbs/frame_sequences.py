@@ -13,13 +13,12 @@ from typing import Any
 
 from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, write_file
-from aaplug.system.errors import FormatError, OutputError, counted, listing
+from aaplug.system.errors import START_AGAIN, FormatError, OutputError, counted, listing
 from aaplug.verbs.views import SUFFIXES, names_image
 
 PLACES = re.compile("#+")  # of a frame's number in a name
 SEPARATORS = "._-"  # between it and the rest
 USUAL_NAME = "frame.####"  # in a folder
-ANEW = "start again with `overwrite`, not `resume`"
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,8 @@ class FrameSequence:
             try:
                 before = dict(json.loads(self.record.read_bytes()))
             except (OSError, ValueError, TypeError) as error:
-                raise FormatError(self.record, f"is damaged; {ANEW}") from error
-            check_request(self.record, before, now, ANEW)
+                raise FormatError(self.record, f"is damaged; {START_AGAIN}") from error
+            check_request(self.record, before, now, START_AGAIN)
             return [place for place, path in enumerate(self.paths) if not path.exists()]
         for path in self.paths:
             if path.exists():
