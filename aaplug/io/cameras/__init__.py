@@ -98,18 +98,10 @@ def read_cameras(
         FormatError: there are no cameras, or a file breaks its format.
         UsageError: an option does not fit.
     """
-    options = CameraFileOptions(train_scale, images, test_every, undistort)
-    if not os.path.exists(path):
-        raise FormatError(path, "there is no such file or folder")
+    cameras = _read(path, CameraFileOptions(train_scale, images, test_every, undistort))
+    if cameras is not None:
+        return cameras
     path = Path(path)
-    if found := recognized(path):
-        with of_file(path):
-            cameras = asked("camera format", found[0], "read", path, options)
-        if not cameras.train:
-            raise FormatError(path, "holds no training cameras")
-        others = [each.sign for each in found if path.is_dir() and each.read != found[0].read]
-        more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
-        return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
     if any(format.sniff(path) for format in PATH_FORMATS):
         raise FormatError(path, "is of a format of camera paths, which `path` of render and video takes")
     signs = "; ".join(format.sign for format in CAMERA_FORMATS.values())
@@ -130,13 +122,29 @@ def read_camera_path(path: str | PathLike[str], *, fps: Annotated[float, Range(a
         if format.sniff(Path(path)):
             with of_file(path):
                 return format.path_of(Path(path), fps)
-    if os.path.exists(path) and not recognized(path):
-        raise FormatError(path, "holds no camera path of a known format; `aaplug guide film-camera` lists them")
     try:
-        cameras = read_cameras(path, test_every=0)
+        cameras = _read(path, CameraFileOptions(test_every=0))
     except UsageError:  # of files that give the split: training views, then test views
-        cameras = read_cameras(path)
+        cameras = _read(path, CameraFileOptions())
+    if cameras is None:
+        raise FormatError(path, "holds no camera path of a known format; `aaplug guide film-camera` lists them")
     return CameraPath(tuple(replace(view, trained_focal=None, photo=None, undistortion=None) for view in cameras.all))
+
+
+def _read(path: str | PathLike[str], options: CameraFileOptions) -> CameraSet | None:
+    """The cameras of a file or folder; None if no format recognizes it.  Raises as `read_cameras`."""
+    if not os.path.exists(path):
+        raise FormatError(path, "there is no such file or folder")
+    path = Path(path)
+    with of_file(path):
+        if not (found := recognized(path)):
+            return None
+        cameras = asked("camera format", found[0], "read", path, options)
+    if not cameras.train:
+        raise FormatError(path, "holds no training cameras")
+    others = [each.sign for each in found if path.is_dir() and each.read != found[0].read]
+    more = [f"other cameras in the folder, not read: {'; '.join(others)}"] if others else []
+    return replace(cameras, files=files_of(path, cameras), notes=(*cameras.notes, *more))
 
 
 def recognized(path: str | PathLike[str]) -> list[CameraFormat]:
