@@ -18,7 +18,7 @@ from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene
 from aaplug.methods.conversion import carried
-from aaplug.rendering.agreement import photo_at
+from aaplug.rendering.agreement import photo_of
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError
 from tests.conftest import moved
@@ -70,7 +70,7 @@ def test_a_mixed_scene_looks_like_its_parts(sample_scene, sample_cameras, sample
         alone = own_look(part, TrainingViews.of(part, sample_cameras), background=WHITE)
         whole = own_look(merged, TrainingViews.of(merged, there), background=WHITE)
         view, same = (cameras.test[0].scaled(0.25) for cameras in (sample_cameras, there))
-        truth = photo_at(sample_cameras.test[0], view, WHITE)
+        truth = photo_of(sample_cameras.test[0], WHITE)(view)
         images = alone(view).rgb.clamp(0, 1), whole(same).rgb.clamp(0, 1)
         errors = torch.stack([(image - truth).square().mean().log10() * 10 for image in images])
         assert errors.diff() < 0.5, part.convention.name

@@ -10,7 +10,7 @@ from PIL import Image
 
 from aaplug.core.imaging import box_average, quantised, stretched
 from aaplug.io.images import read_image
-from aaplug.io.photographs import DOWNSCALES, photo_at
+from aaplug.io.photographs import DOWNSCALES, photo_of
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera
 
@@ -69,12 +69,12 @@ def test_a_photograph_shows_the_whole_view_whatever_size_the_view_was_trained_at
     """A photograph of another width than its view's is resampled, not cropped."""
     view = replace(make_camera(size=(width, width * 2 // 3)), photo=rgba)
     expected = box_average(quantised(read_image(rgba, WHITE)), 4)
-    assert photo_at(view, view.scaled(6 / width), WHITE).equal(expected)
+    assert photo_of(view, WHITE)(view.scaled(6 / width)).equal(expected)
 
 
 def test_a_view_trained_at_a_rounded_size_is_compared_with_the_whole_photograph(rgba):
     """3DGS stretches the photograph to that size, and its cameras keep their field of view."""
     view = replace(make_camera(size=(10, 6)), photo=rgba)  # 6.67 rows, cut
     whole = quantised(read_image(rgba, WHITE))
-    assert torch.allclose(photo_at(view, view, WHITE), stretched(whole, (6, 10)), atol=1e-6)
-    assert torch.allclose(photo_at(view, view.scaled(1 / 2), WHITE), stretched(whole, (3, 5)), atol=1e-6)
+    assert torch.allclose(photo_of(view, WHITE)(view), stretched(whole, (6, 10)), atol=1e-6)
+    assert torch.allclose(photo_of(view, WHITE)(view.scaled(1 / 2)), stretched(whole, (3, 5)), atol=1e-6)

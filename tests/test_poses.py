@@ -118,7 +118,7 @@ def test_evaluate_tells_errors_of_poses_from_others(photographed):
 def test_finetune_refines_poses_first(photographed, monkeypatch):
     scene, cameras = photographed
     found = cameras, ()  # the search itself is tried above
-    monkeypatch.setattr("aaplug.verbs.finetune.refined", lambda job, look, views: found)
+    monkeypatch.setattr("aaplug.verbs.finetune.refined", lambda look, cameras, views, monitor: found)
     off = tuple(moved_by(view, CHANGE, DEPTH) for view in cameras.train)
     how = {"min_seen": 0.0, "steps": 1, "scale": (0.5,), "rasterizer": "eager"}
     errors = []

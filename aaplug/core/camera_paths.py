@@ -15,6 +15,8 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet, numbered, rigid_motion
 from aaplug.core.lenses import ORTHO
+from aaplug.core.rules import NEAR
+from aaplug.system.errors import UsageError
 
 NEIGHBOURS = 6  # cameras nearest to each, between which and itself its free views lie
 LEAST_SHARE, LARGEST_SHARE = 0.2, 0.8  # of the way to the neighbour
@@ -57,6 +59,16 @@ def _ahead(view: Camera) -> Float[Tensor, " 3"]:
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     ray = axis if view.lens == ORTHO else view.rays(axis.new_tensor([view.width / 2, view.height / 2]))
     return ray / ray[2] if ray[2] > 0 else axis
+
+
+def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
+    """Median depth of the Gaussians that project into the view, in world units; raises UsageError if none does."""
+    pixels, depth = view.project(means)
+    x, y = pixels.unbind(dim=1)
+    inside = (depth > NEAR) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
+    if not bool(inside.any()):
+        raise UsageError(view.name, "sees no Gaussian, so there is no distance to change")
+    return float(torch.median(depth[inside]))
 
 
 def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:

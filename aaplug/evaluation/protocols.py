@@ -10,7 +10,6 @@ image size stay.
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -18,9 +17,7 @@ from aaplug.core.camera_paths import moved, zoomed
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
 from aaplug.core.imaging import resampled, stretched
-from aaplug.core.rules import NEAR
 from aaplug.system.contracts import check_fields
-from aaplug.system.errors import UsageError
 
 SsimFlavour = Literal["wang", "3dgs"]
 LpipsFlavour = Literal["3dgs", "vgg", "alex"]
@@ -76,16 +73,6 @@ class Protocol:
         cropped, rounded = "what does not fill a pixel is cropped", "rounded, pixels stretched by less than one"
         sizes = rounded if self.whole_sizes else cropped
         return {"name": self.name, "source": self.source, "scale changes": self.change, "sizes": sizes}
-
-
-def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
-    """Median depth of the Gaussians that project into the view, in world units; raises UsageError if none does."""
-    pixels, depth = view.project(means)
-    x, y = pixels.unbind(dim=1)
-    inside = (depth > NEAR) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
-    if not bool(inside.any()):
-        raise UsageError(view.name, "sees no Gaussian, so there is no distance to change")
-    return float(torch.median(depth[inside]))
 
 
 DEFAULT = Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT)

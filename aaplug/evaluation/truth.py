@@ -18,11 +18,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import Camera
 from aaplug.core.imaging import quantised, resampled
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
-from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
+from aaplug.evaluation.protocols import Protocol, TruthSource
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.presets import find_recipe

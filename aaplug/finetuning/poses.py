@@ -9,16 +9,20 @@ graph by the same residuals; its odometry and graph are left out.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
-from aaplug.evaluation.protocols import median_depth
+from aaplug.core.camera_paths import median_depth
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.finetuning.settings import l2
-from aaplug.io.photographs import photo_at
+from aaplug.io.photographs import photo_of
+from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError, counted
+from aaplug.system.monitor import Monitor
 
 SCALES = (1 / 8, 1 / 4, 1 / 2)  # of the training size
 ITERATIONS = 16  # of L-BFGS at each scale, at most
@@ -41,13 +45,43 @@ class RefinedPose:
     after: float
 
 
+def refined(
+    look: Renderer, cameras: CameraSet, views: Sequence[Camera], monitor: Monitor
+) -> tuple[CameraSet, tuple[RefinedPose, ...]]:
+    """The cameras, with the poses of some views refined, and a note that says by how much.
+
+    look: the scene as training showed it.  monitor: receives progress and the note.
+
+    Raises UsageError if a view has no photograph.
+    """
+    if bare := [view.name for view in views if view.photo is None]:
+        raise UsageError(bare[0], "has no photograph, on which its pose is refined")
+    renderer, poses = look.by(find_recipe("auto", quality="fast")), []
+    with monitor.progress("refining poses", "views") as tell:
+        for done, view in enumerate(views):
+            tell(done, len(views))
+            poses.append(refine_pose(renderer, view))
+    moved = {id(view): pose.camera for view, pose in zip(views, poses, strict=True)}
+    splits = {s: tuple(moved.get(id(v), v) for v in vars(cameras)[s]) for s in ("train", "test")}
+    changed = [(p.degrees, p.distance, p.before, p.after) for p in poses if p.after < p.before]
+    count = counted(len(poses), "pose")
+    note = f"{count}: none moved, as photographs show nothing better"
+    if changed:
+        turn, shift, before, after = map(median, zip(*changed, strict=True))
+        moves = f"{len(changed)} of {count} moved, in the median by {turn:.2g}° and {shift:.2g} units"
+        note = f"{moves}: error at the training size from {before:.1f} to {after:.1f} of 255 levels"
+    monitor.say(note)
+    return replace(cameras, **splits, notes=(*cameras.notes, note)), tuple(poses)
+
+
 def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCALES) -> RefinedPose:
     """Move a view, given at its training size, until its render looks like its photograph.
 
     The view stays where it is if its error at the training size falls by less than `LEAST_GAIN`.  There the scene looks
     as training drew it; in smaller renders, a move may only make up for what aliasing does.
     """
-    camera, depth = view, median_depth(renderer.scene.means, view)
+    photo_at, camera = photo_of(view, renderer.background), view
+    depth = median_depth(renderer.scene.means, view)
 
     def error(camera: Camera) -> Float[Tensor, ""]:
         return LEVELS**2 * l2(renderer(camera.scaled(scale)).rgb, photo)
@@ -60,12 +94,12 @@ def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCAL
 
     for scale in scales:
         sized = view.scaled(scale)
-        focal, photo = sized.focal, photo_at(view, sized, renderer.background)
+        focal, photo = sized.focal, photo_at(sized)
         px = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         how = {"max_iter": ITERATIONS, "tolerance_grad": 0.0, "tolerance_change": LEAST_CHANGE}
         torch.optim.LBFGS([px], **how, line_search_fn="strong_wolfe").step(closure)
         camera = moved_by(camera, px.detach() / focal, depth)
-    scale, photo = 1.0, photo_at(view, view, renderer.background)
+    scale, photo = 1.0, photo_at(view)
     with torch.no_grad():
         before, after = float(error(view)), float(error(camera))
     if after > (1 - LEAST_GAIN) * before:

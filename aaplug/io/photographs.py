@@ -65,17 +65,18 @@ def read_photo(
     path: str | PathLike[str], background: Background, undistortion: Undistortion | None = None
 ) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
-    return quantised(undistorted(read_image(path, background), undistortion))
+    image = undistorted(read_image(path, background), undistortion)
+    return quantised(image)
 
 
-def photo_at(view: Camera, resized: Camera, background: Background) -> Float[Tensor, "h w 3"]:
-    """Read the photograph of a view at the size of `resized`, the same view with pixels denser or sparser.
+def photo_of(view: Camera, background: Background) -> Callable[[Camera], Float[Tensor, "h w 3"]]:
+    """Read the photograph of a view; call it with the same view, with pixels denser or sparser, for its size.
 
     Below the photograph's own size its pixels are averaged; above it they are interpolated (bicubic, which overshoots).
     """
     assert view.photo is not None
     photograph = _box(view.photo, background, view.undistortion)
-    return photograph.at(resized.hw, photograph.factors(view, resized.fx / view.fx))
+    return lambda resized: photograph.at(resized.hw, photograph.factors(view, resized.fx / view.fx))
 
 
 def _box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:

@@ -23,7 +23,7 @@ from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras.camera_path import EXACT
 from aaplug.io.images import encoded, image_size
-from aaplug.io.photographs import photo_at
+from aaplug.io.photographs import photo_of
 from aaplug.live.messages import Order, PickRequest, PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS, depth_map
 from aaplug.live.subject import Subject
@@ -178,7 +178,7 @@ class Pictures:
         assert request.at is not None
         view, (placed, left, top) = self._subject.views[request.at], self._subject.placed_view(request)
         assert view.photo is not None
-        photo = photo_at(view, placed, request.background or self._subject.look.background).clamp(0, 1)
+        photo = photo_of(view, request.background or self._subject.look.background)(placed).clamp(0, 1)
         rows = max(0, top), min(request.height, top + placed.height)
         columns = max(0, left), min(request.width, left + placed.width)
         photo = photo[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]

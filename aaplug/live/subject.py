@@ -9,13 +9,12 @@ from typing import Any
 
 import torch
 
-from aaplug.core.camera_paths import up_of
+from aaplug.core.camera_paths import median_depth, up_of
 from aaplug.core.cameras import Camera, CameraSet, centred, spread
 from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
-from aaplug.evaluation.protocols import median_depth
 from aaplug.io.scenes.scene import Scene
 from aaplug.live.messages import PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS

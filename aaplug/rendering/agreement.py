@@ -14,7 +14,7 @@ from aaplug.core.cameras import CameraSet, spread
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
-from aaplug.io.photographs import photo_at
+from aaplug.io.photographs import photo_of
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
@@ -120,7 +120,7 @@ def _gain(look: Renderer, cameras: CameraSet) -> float | None:
     for view in spread(views, PHOTOGRAPHS):
         small = view.scaled(min(1.0, SIDE / max(view.hw)))
         try:
-            truth, (rgb, alpha) = photo_at(view, small, look.background), look(small)
+            truth, (rgb, alpha) = photo_of(view, look.background)(small), look(small)
         except AaplugError:
             continue
         behind = (1 - alpha)[..., None] * truth.new_tensor([[[colour]] for colour in (BLACK, WHITE, look.background)])

@@ -14,13 +14,13 @@ from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import PAGE, RESULTS, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
+from aaplug.finetuning.poses import refined
 from aaplug.io.atomic import AnyPath, check_name, refuse_existing
 from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
-from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
 
@@ -59,7 +59,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     with running(options, folder, check, job.inputs, folder=True) as workers:
         frames = len(views) * len(recipes) * len(scales)
         if options.poses:
-            job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views)[0])
+            job = replace(job, cameras=refined(job.look(frames, gradients=True), job.cameras, views, job.monitor)[0])
             views = job.views
         look = job.look(frames)
         renderers = renderers_of(job.scene, look.training, recipes, look.rasterizer, look.background)

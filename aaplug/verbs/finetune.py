@@ -24,6 +24,7 @@ from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, up
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
 from aaplug.finetuning.parameters import LEARNED_COLUMNS
+from aaplug.finetuning.poses import refined
 from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
@@ -40,7 +41,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted, listing
 from aaplug.system.monitor import Monitor
-from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import IS_COMPLETE, writes
 
 
@@ -110,7 +110,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     with running(options, path, check, job.inputs), _resumable(checkpoint, resumes, job.monitor):
         raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
         if options.poses:
-            job = replace(job, cameras=refined(job, look, job.cameras.all)[0])
+            job = replace(job, cameras=refined(look, job.cameras, job.cameras.all, job.monitor)[0])
             look = job.look(settings.steps, gradients=True)
         train = job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))

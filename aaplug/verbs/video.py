@@ -14,7 +14,6 @@ from torch import Tensor
 
 from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, digest_of_cameras
-from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
@@ -175,7 +174,7 @@ def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
     job.monitor.say(f"path: {name} from view {view.name}")
     if name == "zoom":
         return camera_paths.frames(lambda t: camera_paths.zoomed(view, rate(t)), count)
-    depth = median_depth(job.scene.gaussians().means, view)
+    depth = camera_paths.median_depth(job.scene.gaussians().means, view)
     if name == "dolly":
         return camera_paths.frames(lambda t: camera_paths.moved(view, rate(t), depth), count)
     up = camera_paths.up_of(job.cameras)

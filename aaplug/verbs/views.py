@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import NEEDS_PINHOLE, Camera
 from aaplug.core.colours import BLACK
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
-from aaplug.evaluation.protocols import median_depth
 from aaplug.io.atomic import check_output, refuse_existing
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core import projection, splats
-from aaplug.core.camera_paths import orbit, up_of
+from aaplug.core.camera_paths import median_depth, orbit, up_of
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import resampled
@@ -25,8 +25,7 @@ from aaplug.core.kernels import EAGER
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.splats import Splats2D
 from aaplug.evaluation.metrics import flip
-from aaplug.evaluation.protocols import median_depth
-from aaplug.io.photographs import photo_at
+from aaplug.io.photographs import photo_of
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers.tiled.binning import bands
@@ -81,7 +80,7 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     pairs = [(i, i + 1) for i in range(FRAMES - 1)]
     motion = mean(flip(truth[a], truth[b]) or 0.0 for a, b in pairs)
     seen = [middle(v, size) for v in opened.views(photographs)]
-    photos = [middle_of(photo_at(v, v, background), size) for v in opened.views(photographs)]
+    photos = [middle_of(photo_of(v, background)(v), size) for v in opened.views(photographs)]
     heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "nearer", "farther", "popping", "PSNR, dB")
     for kind, shares in CASES if others else CASES[:2]:
         images = [drawn(frame, kind, shares) for frame in frames]
@@ -93,7 +92,7 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     heading(f"{scene}, whole views", "order", "PSNR, dB", *(f"ms at {scale:g}" for scale in TIMED_SCALES))
     views = opened.views(whole)
     close = {
-        order: mean(decibels(paint(v).rgb.clamp(0, 1), photo_at(v, v, background)) for v in views)
+        order: mean(decibels(paint(v).rgb.clamp(0, 1), photo_of(v, background)(v)) for v in views)
         for order, paint in orders.items()
     }
     works = {(order, s): partial(paint, view.scaled(s)) for order, paint in orders.items() for s in TIMED_SCALES}

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from aaplug.core.cameras import Camera
 from aaplug.finetuning.poses import RefinedPose, refine_pose
-from aaplug.io.photographs import photo_at
+from aaplug.io.photographs import photo_of
 from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
@@ -59,7 +59,7 @@ def main(views: int = 25) -> None:
 @torch.no_grad()
 def _figures(renderer: Renderer, view: Camera, found: RefinedPose, extent: float) -> Figures:
     chord = float((found.camera.cam_from_world - view.cam_from_world)[:3, :3].norm())  # √8 sin(angle / 2)
-    photo = photo_at(view, view, renderer.background)
+    photo = photo_of(view, renderer.background)(view)
     loss = decibels(renderer(view).rgb, photo) - decibels(renderer(found.camera).rgb, photo)
     share = float((found.camera.centre - view.centre).norm()) / extent
     return Figures(math.degrees(2 * math.asin(chord / math.sqrt(8))), share, loss)

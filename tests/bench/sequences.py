@@ -12,11 +12,10 @@ from tempfile import TemporaryDirectory
 import torch
 from scipy.spatial.transform import Rotation
 
-from aaplug.core.camera_paths import moved
+from aaplug.core.camera_paths import median_depth, moved
 from aaplug.core.cameras import CameraSet
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
-from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.results import mean
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.verbs.evaluate import evaluate

@@ -65,7 +65,8 @@ def write_page(
     from aaplug.evaluation.report.webpage import page
 
     figures = plots(report, bounds)
-    paths = write_texts(folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
+    text = page(name, report, bounds, figures, images, facts)
+    paths = write_texts(folder, {PAGE: text}, overwrite)
     beside = make_folder(Path(folder) / PLOTS)
     for plot in figures:
         for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
