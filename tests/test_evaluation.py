@@ -67,7 +67,7 @@ def drawn(look, view, recipe="classic"):
 
 def task(look, views, source="photographs", protocol="default", recipes=("classic", "matched"), **changes):
     recipes = [find_recipe(recipe) if isinstance(recipe, str) else recipe for recipe in recipes]
-    renderers = renderers_of(look.scene, look.training, recipes, look.rasterizer)
+    renderers = renderers_of(look, recipes)
     truth = Truth(look, source, PROTOCOLS[protocol])
     return Task(**({"renderers": renderers, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth} | changes))
 
@@ -380,8 +380,7 @@ def test_recipes_rank_as_measured_on_the_sample(sample_scene, sample_cameras, sa
     """The order that the project stands for, at 1/8 on one photograph; figures are in the README."""
     recipes = [RECIPES[name] for name in ("classic", "mip", "matched", "auto")]
     look = own_look(sample_scene, sample_training, "eager", WHITE)
-    renderers = renderers_of(sample_scene, sample_training, recipes, "eager", WHITE)
-    task = Task(renderers, (0.125,), sample_cameras.test[1:2], Truth(look, "photographs"), [PSNR])
+    task = Task(renderers_of(look, recipes), (0.125,), sample_cameras.test[1:2], Truth(look, "photographs"), [PSNR])
     report = evaluate(task)
     dB = {name: mean(report.select(name, 0.125), "PSNR") for name in report.recipes}
     assert dB["classic"] + 7 < dB["mip"] < dB["matched"] < dB["auto"] - 6, dB

@@ -74,7 +74,7 @@ def test_evaluation_tells_apart_recipes_that_draw_different_levels():
     truth = Truth(own_look(levels.finest, training, "eager"))
 
     def figures(*recipes: Recipe) -> list[float | None]:
-        renderers = renderers_of(levels, training, recipes, "eager")
+        renderers = renderers_of(own_look(levels, training, "eager"), recipes)
         report = evaluate(Task(renderers, (1 / 8,), VIEWS[:1], truth))
         return [mean(report.select(recipe.name, 1 / 8), "PSNR") for recipe in recipes]
 

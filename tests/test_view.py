@@ -17,7 +17,6 @@ from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, opencv_lens
 from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import read_image, write_png
-from aaplug.io.scenes import scene_of
 from aaplug.live import pictures
 from aaplug.live.messages import PickRequest, PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
@@ -52,7 +51,7 @@ def seen(tmp_path_factory):
 def subject(seen):
     scene, cameras = seen
     look = Renderer.of(scene, cameras, "matched", rasterizer="eager")
-    return Subject(scene_of(scene), cameras, look, RECIPES, "a scene", ())
+    return Subject(cameras, look, RECIPES, "a scene", ())
 
 
 def a_request(subject: Subject, scale=0.5, **other) -> PictureRequest:
@@ -167,7 +166,7 @@ def test_at_rest_a_page_has_the_library_s_own_pictures(subject, at, is_lossless,
     for side, sheet in zip(SIDES, sheets, strict=True):
         how = {"quality": side.quality, "rasterizer": "eager"}
         expected = quantised(
-            Renderer.of(subject.scene, subject.cameras, side.recipe, **how)(subject.camera(request)).rgb
+            Renderer.of(subject.look.source, subject.cameras, side.recipe, **how)(subject.camera(request)).rgb
         )
         assert (float((sheet - expected).abs().max()) < 1.1 / 255) == is_lossless
         assert is_lossless or 40 < psnr(sheet, expected) < 80

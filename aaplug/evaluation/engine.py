@@ -16,11 +16,9 @@ from os import PathLike
 from typing import Any
 
 from aaplug.core.cameras import Camera, digest_of_cameras
-from aaplug.core.colours import Background
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
-from aaplug.core.interfaces import Rasterizer, WorldFilter
-from aaplug.core.training import TrainingViews
+from aaplug.core.interfaces import WorldFilter
 from aaplug.evaluation.coverage import Coverage, above_nyquist, coverage
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
@@ -29,7 +27,6 @@ from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
-from aaplug.io.scenes import SceneLike
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.cost import COMPARED, Cost, cost_of
 from aaplug.rendering.renderer import Renderer
@@ -44,19 +41,13 @@ EQUAL_IMAGES_SIDE = 64  # px: of images that equal their truth, metrics look at 
 Values = Mapping[str, float | None]
 
 
-def renderers_of(
-    scene: SceneLike,
-    training: TrainingViews,
-    recipes: Sequence[Recipe],
-    rasterizer: str | Rasterizer = "auto",
-    background: Background = "auto",
-) -> dict[str, Renderer]:
-    """One scene by several recipes that suit it; those with the same world filter share the filtered scene."""
+def renderers_of(look: Renderer, recipes: Sequence[Recipe]) -> dict[str, Renderer]:
+    """A renderer's scene by several recipes that suit it; those with the same world filter share the filtered scene."""
     shared, renderers = dict[tuple[WorldFilter | None, bool], Renderer](), dict[str, Renderer]()
     for recipe in recipes:
         key = recipe.world, recipe.levels is not None
         if key not in shared:
-            shared[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
+            shared[key] = look.by(recipe)
         renderers[recipe.name] = replace(shared[key], recipe=recipe)
     if len(renderers) < len(recipes):
         raise UsageError("evaluate", "a recipe is named twice")

@@ -15,7 +15,6 @@ from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.scenes.scene import Scene
 from aaplug.live.messages import PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES, RECIPES
@@ -41,7 +40,6 @@ class Subject:
     views: test views first; a page opens with the first one.
     """
 
-    scene: Scene
     cameras: CameraSet
     look: Renderer
     recipes: Sequence[str]
@@ -145,8 +143,7 @@ class Subject:
         return None if best[0] == math.inf else {"decibels": best[0], "view": best[1], "scale": best[2]}
 
     def _prepare(self, side: Side) -> Renderer:
-        recipe, look = find_recipe(side.recipe, quality=side.quality), self.look
-        return Renderer.of(self.scene, look.training, recipe, background=look.background, rasterizer=look.rasterizer)
+        return self.look.by(find_recipe(side.recipe, quality=side.quality))
 
     @cached_property
     def _by_prominence(self) -> torch.Tensor:

@@ -13,11 +13,10 @@ import torch
 from aaplug.core.cameras import CameraSet, spread
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
-from aaplug.core.training import TrainingViews
 from aaplug.io.photographs import photo_of
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
-from aaplug.rendering.renderer import Renderer, background_colour, own_look
+from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import AaplugError
 from aaplug.system.monitor import SILENT, Monitor
 
@@ -90,13 +89,9 @@ def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scen
     """
     if scene.other is None or cameras.assumed:
         return scene
-    readings, background = (scene.decoded(), scene.other.decoded()), background_colour("auto", cameras)
-    fits = []
-    for reading in readings:
-        gaussians = usable(reading.raw(0, reading.count))
-        look = own_look(gaussians, TrainingViews.of(gaussians, cameras), background=background)
-        fits.append(agreement(look, cameras))
-    first, second = fits
+    readings = scene.decoded(), scene.other.decoded()
+    looks = (own_look(usable(reading.raw(0, reading.count)), cameras) for reading in readings)
+    first, second = fits = [agreement(look, cameras) for look in looks]
     if first.gain is not None and second.gain is not None:
         better = second.gain > first.gain
     else:

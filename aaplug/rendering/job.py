@@ -17,7 +17,6 @@ from typing import Generic, TypeVar
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.interfaces import TakesMemory
-from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
@@ -110,8 +109,7 @@ class Job(Generic[O_co]):
             rasterizer = find_rasterizer(rasterizer, frames, say, gradients=gradients)
         if options.memory is not None and isinstance(rasterizer, TakesMemory):
             rasterizer = rasterizer.within(options.memory * 1e9)
-        training = self.training(self.scene)
-        look = own_look(self.scene, training, rasterizer, colour)
+        look = own_look(self.scene, self.cameras, rasterizer, colour, options.cull_margin, options.min_seen)
         if check:
             self.check_fit(look)
         return look
@@ -127,13 +125,6 @@ class Job(Generic[O_co]):
             if self.options.min_seen > 0:
                 raise FrameError(look.scene.name, f"{problem}; if they are right, pass `min_seen` 0")
             log.warning("%s: %s", look.scene.name, problem)
-
-    def training(self: "Job[ViewOptions]", scene: Scene) -> TrainingViews:
-        """The training views of a scene; raises FrameError as `TrainingViews.of`."""
-        options = self.options
-        gaussians, _ = without_harmonics(scene)
-        training = TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
-        return training if scene.frames is None else scene.frames.over_all(training)
 
     def named(self: "Job[RecipeOptions]", *recipes: str | Recipe) -> list[Recipe]:
         """Recipes as they are, or by name as the options say; says which of these options none of them takes."""

@@ -495,14 +495,21 @@ def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaus
 
 
 def own_look(
-    scene: SceneLike, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
+    scene: SceneLike,
+    cameras: CameraSet | TrainingViews,
+    rasterizer: str | Rasterizer = "auto",
+    background: Background = "auto",
+    cull_margin: Margin = math.inf,
+    min_seen: Share = 0.0,
 ) -> Renderer:
     """A renderer of the scene by training's own rule, at any size (recipe `matched`); its finest level alone.
 
-    2D Gaussians are drawn as discs, by `2dgs-matched` with one sample per pixel.
+    2D Gaussians are drawn as discs, by `2dgs-matched` with one sample per pixel.  Arguments and errors: see
+    `Renderer.of`.
     """
     recipe = replace(find_recipe("matched"), for_discs=find_recipe("auto").for_discs)
-    return Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
+    drawn = {"rasterizer": rasterizer, "background": background}
+    return Renderer.of(scene, cameras, recipe, **drawn, cull_margin=cull_margin, min_seen=min_seen)
 
 
 @contract

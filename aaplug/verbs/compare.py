@@ -67,7 +67,10 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     with running(options, folder, check, inputs, folder=True) as workers:
         look = job.look(len(views) * len(scales) * len(rows))
         [recipe], same = job.named(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
-        renderers = [Renderer.of(scene, job.training(scene), recipe, **same) for scene in named.values()]
+        renderers = [
+            Renderer.of(s, job.cameras, recipe, **same, cull_margin=options.cull_margin, min_seen=options.min_seen)
+            for s in named.values()
+        ]
         truth = Truth(renderers[0], "reference", PROTOCOL)
         if viewer is not None:
             recipe, pairs = recipe_of(viewer), zip(named.values(), renderers, strict=True)

@@ -23,7 +23,7 @@ from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import background_colour, own_look
+from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import Threads
 from aaplug.system.monitor import Tell
@@ -120,10 +120,10 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         else:
             gaussians, training = job.scene.gaussians(), None
             if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
-                training = TrainingViews.of(gaussians, job.cameras, min_seen=options.min_seen)
-                look = own_look(gaussians, training, background=background_colour(options.background, job.cameras))
+                look = own_look(gaussians, job.cameras, background=options.background, min_seen=options.min_seen)
                 job.check_fit(look)
                 job.say_assumed(look)
+                training = look.training
             fused = fuse(gaussians, training, rule)
         if path is not None:
             write_scene(path, fused, **files)
@@ -135,15 +135,13 @@ def _write_frames(
 ) -> int:
     """Write the closed form of a scene in time, frame by frame; returns the number of Gaussians."""
     job.say_assumed()
-    training, count = job.training(job.scene), 0
+    options, count = job.options, 0
+    look = own_look(job.scene, job.cameras, "auto", options.background, options.cull_margin, options.min_seen)
+    job.check_fit(look)
     with job.monitor.progress("converting", "frames") as tell:
         for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
             gaussians = frame.gaussians()
-            trained = frames.training_of(gaussians, training)
-            if done == 1:
-                colour = background_colour(job.options.background, job.cameras)
-                job.check_fit(own_look(gaussians, trained, background=colour))
-            write_scene(output, fuse(gaussians, trained, form), **files)
+            write_scene(output, fuse(gaussians, frames.training_of(gaussians, look.training), form), **files)
             count += len(gaussians)
             tell(done, len(frames))
     return count

@@ -62,7 +62,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             job = replace(job, cameras=refined(job.look(frames, gradients=True), job.cameras, views, job.monitor)[0])
             views = job.views
         look = job.look(frames)
-        renderers = renderers_of(job.scene, look.training, recipes, look.rasterizer, look.background)
+        renderers = renderers_of(look, recipes)
         task = Task(renderers, scales, views, Truth(look, source, protocol), metrics)
         job.announce([*task.renderers.values()], task.sized_views, cost=task.cost)
         job.say_assumed(look)

@@ -13,7 +13,6 @@ from torch import Tensor
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import placed
-from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import check_scene_output, scene_of, write_scene
 from aaplug.io.scenes.faults import check_values
@@ -23,7 +22,7 @@ from aaplug.methods.conversion import carried
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import background_colour, own_look
+from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import ScenesLike, compares
 
@@ -66,12 +65,12 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
         for scene, job, (turn, scale, move) in zip(opened, jobs, places, strict=True):
             part = fuse_stored((job.scene if job else scene).gaussians())
             if job:
-                training = TrainingViews.of(part, job.cameras, min_seen=options.min_seen)
-                job.check_fit(own_look(part, training, background=background_colour("auto", job.cameras)))
-                known = f"by {counted(len(training.cameras), 'camera')}"
+                look = own_look(part, job.cameras, min_seen=options.min_seen)
+                job.check_fit(look)
+                known = f"by {counted(len(job.cameras.train), 'camera')}"
                 views = job.cameras.notes[0] if job.cameras.assumed else known
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")
-                part = carried(part, training, into)
+                part = carried(part, look.training, into)
             if lost := beside(part):
                 options.monitor.say(f"{scene.title}: the merged scene does not have its {lost}")
             parts.append(replace(placed(part, turn, scale, move), extras={}, origin=None))

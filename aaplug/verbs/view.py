@@ -36,7 +36,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
         job.say_assumed()
         recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
         title = title or job.scene.title
-        return Subject(job.scene, job.cameras, look, recipes, title, words or (str(job.scene.file or title),))
+        return Subject(job.cameras, look, recipes, title, words or (str(job.scene.file or title),))
 
     def dropped(path: Path) -> Subject:
         return subject_of(path, None, path.name, (path.name,))
