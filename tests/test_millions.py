@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
@@ -80,3 +81,12 @@ def test_evaluation_tells_apart_recipes_that_draw_different_levels():
 
     assert figures(fine, coarse) == [*figures(fine), *figures(coarse)]
     assert figures(fine) != figures(coarse)
+
+
+def test_a_comparison_of_levels_is_written_and_is_of_all_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr("aaplug.verbs.compare.write_page", lambda *given: [])
+    levels, other = in_one_chunk(200, 50), in_one_chunk(200, 40)
+    how = {"output": tmp_path / "out", "scale": (1 / 8,), "rasterizer": "eager", "metric": "psnr", "resume": True}
+    aaplug.compare({"levels": levels, "finest": levels.finest}, CAMERAS, **how)
+    with pytest.raises(aaplug.UsageError, match="scenes_sha256"):
+        aaplug.compare({"levels": other, "finest": levels.finest}, CAMERAS, **how)

@@ -19,6 +19,7 @@ from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import WorldFilter
+from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import Coverage, above_nyquist, coverage
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
@@ -117,11 +118,11 @@ class Task:
         seconds = images.seconds + sum(cost.seconds for cost in truths) + COMPARED * compared
         return images._replace(seconds=seconds, image=max(images.image, *(cost.image for cost in truths)))
 
-    def coverage(self, scene: Gaussians) -> Coverage:
-        """The scene's extents against their sampling bounds, and the renderers' energy above the Nyquist rate."""
+    def coverage(self, scene: Gaussians, training: TrainingViews) -> Coverage:
+        """The scene's extents against its sampling bounds, and the renderers' energy above the Nyquist rate."""
         drawn = product(self.renderers.items(), self.scales if self.resizes else ())
         above = {(name, scale): above_nyquist(renderer, self.views, scale) for (name, renderer), scale in drawn}
-        return replace(coverage(scene, self.truth.renderer.training, self.scales), above_nyquist=above)
+        return replace(coverage(scene, training, self.scales), above_nyquist=above)
 
     @property
     def resizes(self) -> bool:

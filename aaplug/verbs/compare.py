@@ -8,7 +8,6 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import digest_of_scene
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
 from aaplug.evaluation.engine import Task, evaluate, facts_of
@@ -82,7 +81,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             "rows": "compared scene",
             "reference": rows[0].name,
             "viewer": viewer and viewer.name,
-            "scenes_sha256": {name: digest_of_scene(scene.gaussians()) for name, scene in named.items()},
+            "scenes_sha256": {name: scene.digest for name, scene in named.items()},
             "options": options.choices | {"shown": options.show},
         }
         if folder and options.overwrite:
@@ -91,7 +90,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, workers.pool.map)
         comparison = Comparison(rows, report)
         if folder and images:
-            bounds = task.coverage(job.scene.gaussians())
+            bounds = task.coverage(job.scene.gaussians(), look.training)
             replaces = options.overwrite or options.resume
             data, table, sheet = COMPARED
             texts = {data: as_json(comparison.summary()), table: as_csv({rows[0].name: report})}

@@ -87,7 +87,8 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             texts = as_json(results(report)), as_json(per_view(report)), as_csv({name: report})
             files = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), replaces)
             if options.report:
-                files += write_page(folder, name, report, task.coverage(job.scene.gaussians()), images, replaces)
+                bounds = task.coverage(job.scene.gaussians(), look.training)
+                files += write_page(folder, name, report, bounds, images, replaces)
             for written in files:
                 job.monitor.say(f"wrote {written}")
     return report
