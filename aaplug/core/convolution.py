@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians, scale_opacities
+from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError
 
@@ -46,3 +46,11 @@ def face_log_factor(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "
 def _axis_log_factors(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]) -> Float[Tensor, "n 3"]:
     log_ratio = torch.where(log_sigma == -torch.inf, -torch.inf, 2 * (log_sigma - log_scales))  # also where both are
     return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))
+
+
+def fuse_stored(scene: Gaussians) -> Gaussians:
+    """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
+    if scene.filter_3d is None:
+        return scene
+    smoothed = smoothed_by(scene, scene.filter_3d.log()[:, None], volume=True)
+    return replace(smoothed, filter_3d=None, fused=(*scene.fused, Fusion("filter_3D")))

@@ -20,13 +20,13 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.conventions import CLASSIC
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.projection import project
 from aaplug.lab.pixel_size import LEAST_SHARE, MAX_SMALL_SIZE, MOST_SHARE, PixelSizes, pixel_size
 from aaplug.levels.clusters import clusters_of, gaussians_of, rates_of
 from aaplug.levels.merging import Goal, rounds
 from aaplug.methods.conversion import MERGED
-from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import Tell
 

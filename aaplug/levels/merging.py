@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from aaplug.core.chunks import curve, squeezed
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.pyramids import Level
 from aaplug.levels.clusters import Clusters, clusters_of, gaussians_of, merge_pairs
@@ -22,7 +23,6 @@ from aaplug.levels.covariances import areas, blur, covariances
 from aaplug.levels.pairing import Edges, edges_below, matching
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
-from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.system.cores import on_free_cores
 from aaplug.system.executors import Threads, given_threads
 from aaplug.system.monitor import Tell

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from aaplug.core.conventions import MIP, Convention
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters.energy import MATCHED_ENERGY, MatchedEnergy
-from aaplug.methods.filters.smoothing import BY_VOLUME, Smoothing3D, fuse_stored
+from aaplug.methods.filters.smoothing import BY_VOLUME, Smoothing3D
 from aaplug.methods.viewers import Viewer
 from aaplug.system.errors import UsageError
 

@@ -4,12 +4,15 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Compositor, PixelKernel, ReadsColumns, ScreenFilter, Selection, WorldFilter
+from aaplug.core.training import TrainingViews
 from aaplug.methods import QUALITIES, SplatOrder
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.digests import digest_of_values
+from aaplug.system.plug_ins import filtered
 
 MAX_SAMPLES = 64  # along a pixel's side that a rate asks for; a mean of 4096 tells less than an 8-bit step from more
 Rate = Annotated[float, Range(above=0)]  # relative to training
@@ -118,6 +121,14 @@ class Recipe:
         does, with the part of a sample that training's pixel did not cover.
         """
         return self.neighbours * max(0.0, 1 - sampled_rate**2)
+
+    def prepared(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
+        """The scene after what acts once on it: its stored 3D filter, which is part of it, then the world filter.
+
+        A world filter is applied even if the scene already contains one: use `mip` if it stores `filter_3D`.
+        """
+        scene = fuse_stored(scene)
+        return scene if self.world is None else filtered("world filter", self.world, scene, training)
 
     @contract
     def lacks(self, scene: Gaussians) -> str | None:

@@ -41,7 +41,6 @@ from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.scene import Scene, SceneFrames, without_harmonics
 from aaplug.methods.filters.matched import Matched
-from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY, with_copies
@@ -152,7 +151,7 @@ class Renderer:
         recipe = suited(recipe, gaussians)
         colour = background_colour(background, cameras)
         cutter = Cutter.of(pyramid, training) if pyramid else None
-        filtered = _filtered(gaussians, training, recipe)
+        filtered = recipe.prepared(gaussians, training)
         return cls(filtered, training, recipe, rasterizer, colour, harmonics, cutter, source, source.frames)
 
     @contract
@@ -171,7 +170,7 @@ class Renderer:
             return replace(self, training=training, cutter=cutter)
         assert self.source is not None
         raw = without_harmonics(self.source)[0] if self.cutter is None else self.cutter.pyramid.scene
-        return replace(self, scene=_filtered(raw, training, self.recipe), training=training, cutter=cutter)
+        return replace(self, scene=self.recipe.prepared(raw, training), training=training, cutter=cutter)
 
     @contract
     def showing(self, scene: Gaussians) -> "Renderer":
@@ -205,7 +204,7 @@ class Renderer:
             self._open.clear()
             gaussians, harmonics = without_harmonics(self.in_time.open(self.in_time.paths[frame]))
             training = self.in_time.training_of(gaussians, self.training)
-            scene = _filtered(gaussians, training, self.recipe)
+            scene = self.recipe.prepared(gaussians, training)
             now = replace(self, scene=scene, training=training, harmonics=harmonics, source=None, in_time=None)
             self._open[frame] = now
         return self._open[frame]
@@ -222,10 +221,10 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            if (now := self.at(camera.frame)) is not self:
-                return now(camera)
             if camera.exposure is None:
                 return self.draw(camera).render
+            if (now := self.at(camera.frame)) is not self:
+                return now(camera)
             count, samples = self.frames(camera)
             weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
             fine = self._fine(camera, samples)
@@ -249,12 +248,12 @@ class Renderer:
 
     def _fine(self, camera: Camera, samples: int) -> Camera:
         """The camera of the supersampled image; raises UsageError where memory does not suffice."""
-        fine = camera if samples == 1 else camera.resized(camera.width * samples, camera.height * samples)
-        pixels = fine.width * fine.height
+        width, height = camera.width * samples, camera.height * samples
+        pixels = width * height
         if pixels > UNCHECKED_SAMPLES and (lacking := lack_of_memory(SAMPLE_BYTES * pixels)):
             problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
             raise UsageError(f"view {camera.name} at {camera.width}x{camera.height}", problem)
-        return fine
+        return camera if samples == 1 else camera.resized(width, height)
 
     @contract
     @torch.no_grad()
@@ -483,15 +482,6 @@ class Renderer:
     def kernels(self) -> Kernels:
         """The kernels that run the stages before the rasterizer, as it runs its own."""
         return kernels_of(self.rasterizer)
-
-
-def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:
-    """Apply what acts once per scene: its stored 3D filter, which is part of it, then the recipe's world filter.
-
-    A world filter is applied even if the scene already contains one: use `mip` if it stores `filter_3D`.
-    """
-    scene = fuse_stored(scene)
-    return scene if recipe.world is None else filtered("world filter", recipe.world, scene, training)
 
 
 def own_look(

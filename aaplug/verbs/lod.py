@@ -13,6 +13,7 @@ import torch
 from aaplug.core.camera_paths import up_of
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Gaussians, digest_of_scene, joined
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Level
@@ -32,7 +33,6 @@ from aaplug.io.streamed import STREAMS, Front
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.conversion import fuse_for
-from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.assumed import PROBE_ROWS

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from aaplug.core.conventions import CONVENTIONS, MIP
+from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import placed
 from aaplug.io.atomic import AnyPath
@@ -19,7 +20,6 @@ from aaplug.io.scenes.faults import check_values
 from aaplug.io.scenes.packed import of_degree
 from aaplug.io.scenes.ply import beside
 from aaplug.methods.conversion import carried
-from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import own_look

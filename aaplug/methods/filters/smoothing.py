@@ -55,12 +55,4 @@ class Smoothing3D:
         return replace(smoothed, fused=(*scene.fused, Fusion("smoothing3d", settings)))
 
 
-def fuse_stored(scene: Gaussians) -> Gaussians:
-    """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
-    if scene.filter_3d is None:
-        return scene
-    smoothed = smoothed_by(scene, scene.filter_3d.log()[:, None], volume=True)
-    return replace(smoothed, filter_3d=None, fused=(*scene.fused, Fusion("filter_3D")))
-
-
 BY_VOLUME = Smoothing3D()
