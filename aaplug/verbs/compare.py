@@ -77,16 +77,16 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         task = Task(dict(zip(named, renderers, strict=True)), scales, views, truth, metrics, ceiling=False)
         job.announce([*task.renderers.values()], task.sized_views, cost=task.cost, processes=workers.threads)
         job.say_assumed(look)
-        facts = facts_of(task, job.cameras.notes) | {
-            "rows": "compared scene",
-            "reference": rows[0].name,
-            "viewer": viewer and viewer.name,
-            "scenes_sha256": {name: scene.digest for name, scene in named.items()},
-            "options": options.choices | {"shown": options.show},
-        }
-        if folder and options.overwrite:
-            remove_run(folder)
         with job.monitor.progress("comparing", "views") as tell:
+            facts = facts_of(task, job.cameras.notes) | {
+                "rows": "compared scene",
+                "reference": rows[0].name,
+                "viewer": viewer and viewer.name,
+                "scenes_sha256": {name: scene.digest for name, scene in named.items()},
+                "options": options.choices | {"shown": options.show},
+            }
+            if folder and options.overwrite:
+                remove_run(folder)
             report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, workers.pool.map)
         comparison = Comparison(rows, report)
         if folder and images:

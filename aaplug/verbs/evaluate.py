@@ -66,22 +66,22 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         task = Task(renderers, scales, views, Truth(look, source, protocol), metrics)
         job.announce([*task.renderers.values()], task.sized_views, cost=task.cost)
         job.say_assumed(look)
-        choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
-        whole = job.scene.gaussians() if job.scene.levels is None else job.scene.levels.scene
-        file = whole.origin and Path(whole.origin.path)
-        about = {
-            "file": file and file.name,
-            "sha256": digest_of_files([file]) if file and file.is_file() else None,
-            "gaussians": len(whole),
-            "gaussians_sha256": job.scene.digest,
-            "convention": whole.convention.name,
-            "evidence": whole.origin and whole.origin.evidence,
-        }
-        facts = {**facts_of(task, job.cameras.notes), "scene": about, "options": choices}
-        apply = workers.cluster.map if workers.cluster else map
-        if folder and options.overwrite:
-            remove_run(folder)
         with job.monitor.progress(f"evaluating {name}", "views") as tell:
+            choices = options.choices | {"shown": options.show if options.report else None, "layout": options.layout}
+            whole = job.scene.gaussians() if job.scene.levels is None else job.scene.levels.scene
+            file = whole.origin and Path(whole.origin.path)
+            about = {
+                "file": file and file.name,
+                "sha256": digest_of_files([file]) if file and file.is_file() else None,
+                "gaussians": len(whole),
+                "gaussians_sha256": job.scene.digest,
+                "convention": whole.convention.name,
+                "evidence": whole.origin and whole.origin.evidence,
+            }
+            facts = {**facts_of(task, job.cameras.notes), "scene": about, "options": choices}
+            apply = workers.cluster.map if workers.cluster else map
+            if folder and options.overwrite:
+                remove_run(folder)
             report = measure(task, facts, tell, folder and folder / JOURNAL, options.resume, images, apply)
         if folder and images:
             texts = as_json(results(report)), as_json(per_view(report)), as_csv({name: report})

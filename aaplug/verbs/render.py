@@ -8,7 +8,6 @@ from typing import NamedTuple
 from aaplug.core.cameras import Camera
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path, select_views
-from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.frames import write_frames
@@ -48,8 +47,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     job = Job.of(scene, cameras, options, single=names_image(target))
     path = None if options.path is None else read_camera_path(options.path)
     ends = select_views(job.cameras, options.camera_to, "camera_to") if options.camera_to else ()
-    shown = path or CameraPath(job.views, unsized=job.cameras.assumed)
-    views = [view for eyes in zip(*drawn(job, shown, path is not None, ends), strict=True) for view in eyes]
+    views = [view for eyes in zip(*drawn(job, path, ends), strict=True) for view in eyes]
     [recipe] = job.fitted(options.recipe)
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()

@@ -92,7 +92,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     beside = "none" if alone or options.beside is None else options.beside
     recipes = job.fitted(*(name for name in (beside, options.recipe) if name != "none"))
     path = file or CameraPath(tuple(_built_in_path(job, fps)), unsized=job.cameras.assumed)
-    eyes = drawn(job, path, True)
+    eyes = drawn(job, path)
     views = eyes[0]
     if len({view.hw for view in views}) > 1:
         raise UsageError("path", f"has frames of different sizes ({sizes_of(views)} px); give `resolution`")

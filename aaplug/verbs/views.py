@@ -28,11 +28,12 @@ STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
 
 
-def drawn(job: Job[Drawn], path: CameraPath, moves: bool, ends: Sequence[Camera] = ()) -> list[list[Camera]]:
+def drawn(job: Job[Drawn], path: CameraPath | None, ends: Sequence[Camera] = ()) -> list[list[Camera]]:
     """The cameras of each eye: two for vr180, else one; with the lens, size and exposure that a job's options ask for.
 
-    moves: the cameras are frames of one motion.  ends: where the shutter closes, see `filmed`.
+    path: frames of one motion; None for the job's views.  ends: where the shutter closes, see `filmed`.
     """
+    moves, path = path is not None, path or CameraPath(job.views, unsized=job.cameras.assumed)
     cameras, count = path.cameras, 2 if job.options.lens == "vr180" else 1
     if moves and job.scene.frames is not None:  # a scene in time passes once
         moments = len(job.scene.frames)
