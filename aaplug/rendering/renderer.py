@@ -158,8 +158,7 @@ class Renderer:
     def by(self, recipe: Recipe) -> "Renderer":
         """The same scene by another recipe."""
         assert self.source is not None
-        same = {"background": self.background, "rasterizer": self.rasterizer}
-        return Renderer.of(self.source, self.training, recipe, **same)
+        return Renderer.of(self.source, self.training, recipe, background=self.background, rasterizer=self.rasterizer)
 
     @contract
     def trained_at(self, factor: Factor) -> "Renderer":
@@ -176,8 +175,7 @@ class Renderer:
     def showing(self, scene: Gaussians) -> "Renderer":
         """The same for another scene: its sampling bounds are computed from the same cameras."""
         training = TrainingViews.of(scene, self.training.cameras, self.training.cull_margin)
-        same = {"background": self.background, "rasterizer": self.rasterizer}
-        return Renderer.of(scene, training, self.recipe, **same)
+        return Renderer.of(scene, training, self.recipe, background=self.background, rasterizer=self.rasterizer)
 
     def portable(self) -> "Renderer":
         """The same for another process, without the scene's file, which may be open."""
@@ -285,7 +283,8 @@ class Renderer:
             camera = replace(camera, exposure=None)
             render, splats, hw = self.draw(camera)
             found: dict[str, Tensor] = (exposed or render)._asdict()
-            (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
+            samples, weight = self.sampling(camera)
+            fine = self._fine(camera, samples)
             recipe = self.recipe_through(splats.camera)
             per_call = [CHANNELS] if recipe.compositor else channels_at_once(self.rasterizer, recipe.pixel)
             paint = partial(self.paint, hw=hw, background=BLACK)
