@@ -369,10 +369,21 @@ def test_larger_truth_has_the_averages_of_the_training_size(look, views):
     assert off[0] < 0.2 * off[1]
 
 
-def test_what_a_recipe_draws_by_is_part_of_the_request(look, views, tmp_path):
-    first, changed = (task(look, views[:1], recipes=[replace(RECIPES["mip"], grid=grid)]) for grid in (1, 2))
+def sharpness(weight):
+    return Metric("sharpness", "", 0.0, 2, "mean", lambda image, truth: weight * float(image.mean()))
+
+
+CHANGED = {
+    "recipes_sha256.mip": [{"recipes": [replace(RECIPES["mip"], grid=grid)]} for grid in (1, 2)],
+    "metrics_sha256.sharpness": [{"metrics": [sharpness(weight)]} for weight in (1, 2)],
+}
+
+
+@pytest.mark.parametrize("part", CHANGED)
+def test_what_a_recipe_draws_by_and_a_metric_measures_by_is_part_of_the_request(look, views, tmp_path, part):
+    first, changed = (task(look, views[:1], **choices) for choices in CHANGED[part])
     evaluate(first, journal=tmp_path / "journal")
-    with pytest.raises(UsageError, match=r"another aaplug \(recipes_sha256.mip changed"):
+    with pytest.raises(UsageError, match=rf"another aaplug \({part} changed"):
         evaluate(changed, journal=tmp_path / "journal", resume=True)
 
 

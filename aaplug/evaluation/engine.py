@@ -31,7 +31,7 @@ from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.cost import COMPARED, Cost, cost_of
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.digests import digest_of_files
+from aaplug.system.digests import digest_of_files, digest_of_values
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import Apply
 from aaplug.system.monitor import Tell
@@ -185,6 +185,7 @@ def _request(task: Task) -> dict[str, Any]:
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
         "background": list(task.truth.renderer.background),
         "metrics": {metric.name: metric.protocol for metric in task.measured},
+        "metrics_sha256": {metric.name: digest_of_values(metric) for metric in task.measured},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
         "scales": list(task.scales),
