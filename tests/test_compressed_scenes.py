@@ -297,12 +297,16 @@ def test_no_format_is_written_with_what_it_cannot_hold(tmp_path: Path, expected,
     assert len(read_scene(path).gaussians()) == len(expected)
 
 
-def test_a_splat_says_what_it_loses(tmp_path: Path, expected, caplog):
-    write_scene(tmp_path / "plain.splat", replace(expected, sh=expected.sh[:, :1], convention=CLASSIC))
+@pytest.mark.parametrize("name", ["splat", "toy"])
+def test_a_format_says_what_it_loses(tmp_path: Path, expected, caplog, monkeypatch, name):
+    """The seam says it for a plug-in, too."""
+    monkeypatch.setitem(SCENE_FORMATS._entries, "toy", Toy())
+    write_scene(tmp_path / f"plain.{name}", replace(expected, sh=expected.sh[:, :1], convention=CLASSIC))
     assert not caplog.text
-    write_scene(tmp_path / "rich.splat", replace(expected, convention=MIP))
+    write_scene(tmp_path / f"rich.{name}", replace(expected, convention=MIP))
     [record] = caplog.records
-    assert "cannot hold harmonics above degree 0 and the record of its training (mip); a .ply can" in record.message
+    lost = "harmonics above degree 0 and the record of its training (mip)"
+    assert f"a .{name} cannot hold {lost}; a .ply can" in record.message
 
 
 def test_the_farthest_position_of_a_spz_stays_on_its_side(tmp_path: Path):

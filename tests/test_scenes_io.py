@@ -239,7 +239,7 @@ def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):
             write_scene(tmp_path / f"{name}.{suffix}", scene)
         merge([scene], None, None)
     warned = [message for message in caplog.messages if "cannot hold" in message]
-    assert warned == [f"{tmp_path / 'own.glb'}: the format cannot hold {lost}; a .ply can"]
+    assert warned == [f"{tmp_path / 'own.glb'}: a .glb cannot hold {lost}; a .ply can"]
     assert said == [f"own.ply: the merged scene does not have its {lost.removeprefix('the ')}"]
 
 

@@ -30,7 +30,7 @@ from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, write_file
 from aaplug.io.images import image_size, write_png
-from aaplug.io.scenes import SceneLike, check_scene_output, read_scene, write_scene, written_format
+from aaplug.io.scenes import SceneLike, check_scene_output, kept_by, read_scene, write_scene, written_format
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import FAST, VIEWERS
@@ -93,11 +93,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     replaces = options.overwrite or resumes  # beside a checkpoint, the other files are of the same run
     check = partial(_check, path, job.scene.files, options.resume, replaces)
     check()
-    if (
-        path is not None
-        and LEARNED_COLUMNS in settings.rates
-        and not getattr(written_format(path), "keeps_extras", False)
-    ):
+    if path is not None and LEARNED_COLUMNS in settings.rates and "extras" not in kept_by(written_format(path)):
         raise OutputError(path, "holds no learned filters; a .ply does")
     truth_source = source_of(job.cameras.train, options.truth)
     photographs = truth_source == "photographs"

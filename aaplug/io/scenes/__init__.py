@@ -8,14 +8,14 @@ in the format whose name ends the file's name.
 
 import logging
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
+from aaplug.core.conventions import CLASSIC, Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io import STREAM_INDEXES
@@ -24,7 +24,7 @@ from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt
 from aaplug.io.scenes.faults import described_faults, faults_of
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
-from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
+from aaplug.io.scenes.scene import COMPENSATED, FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, PlugInError, UsageError, listing
@@ -62,8 +62,11 @@ class WritableFormat(SceneFormat, Protocol):
     """A format that can be written too.  needs: a package that writing imports, or None.
 
     It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.  A format
-    whose files another one reads, names it as `read_as`.  One that writes what `ply.beside` names has a true
-    `keeps_extras`; for others a warning names what is lost.
+    whose files another one reads, names it as `read_as`.  What the files of this name keep is in the attribute `keeps`;
+    a warning names what is lost, all of the following without this attribute:
+        "harmonics": those above degree 0.
+        "record": the convention and fusions.  "compensation": of the convention, whether opacities are compensated.
+        "extras": what `ply.beside` names.
     """
 
     @property
@@ -214,22 +217,38 @@ def write_parts(
     inputs: files that are being read and may not be replaced.  Errors: see `write_scene`.
     """
     writer = check_scene_output(path, overwrite, inputs)
-    storable = _storable(path, parts, getattr(writer, "keeps_extras", False))
+    storable = _storable(path, parts, writer)
     options = SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version)
     asked("scene format", writer, "write", Path(path), storable, count, overwrite, options)
     if not Path(path).exists():
         raise PlugInError(f"scene format {writer.name}", f"has not written {path}")
 
 
-def _storable(path: AnyPath, parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:
+def _storable(path: AnyPath, parts: Iterable[Gaussians], writer: WritableFormat) -> Iterator[Gaussians]:
     """The parts as float32 on the CPU; raises OutputError for values that no renderer can use."""
     for place, part in enumerate(parts):
-        if not place and not keeps_extras and (lost := ply.beside(part)):
-            log.warning("%s: the format cannot hold the %s; a .ply can", path, lost)
+        if not place and (lost := [*_losses(part, kept_by(writer))]):
+            log.warning("%s: a %s cannot hold %s; a .ply can", path, _ending(writer), " and ".join(lost))
         part = replace(part, **{name: column.detach().cpu().float() for name, column in part.columns.items()})
         if faults := faults_of(part):
             raise OutputError(path, f"the scene to write cannot be used: {described_faults(faults)}")
         yield part
+
+
+def _losses(scene: Gaussians, keeps: Collection[str]) -> Iterator[str]:
+    """What files do not tell of a scene, in words."""
+    told = COMPENSATED if "compensation" in keeps and scene.convention.compensated else CLASSIC
+    if "extras" not in keeps and (beside := ply.beside(scene)):
+        yield f"the {beside}"
+    if "harmonics" not in keeps and scene.sh_degree:
+        yield "harmonics above degree 0"
+    if "record" not in keeps and (scene.convention != told or scene.fused):
+        yield f"the record of its training ({scene.convention.name})"
+
+
+def kept_by(format: SceneFormat | None) -> Collection[str]:
+    """What files of a format keep; see `WritableFormat`."""
+    return getattr(format, "keeps", ())
 
 
 def written_format(path: AnyPath) -> WritableFormat | None:

@@ -42,6 +42,7 @@ LARGEST_LOG_SCALE = 20.0  # absolute: a wider chunk of log-scales would leave it
 
 name = "compressed.ply"
 needs = None
+keeps = ("harmonics", "record")
 
 
 def sniff(path: Path, head: bytes) -> bool:

@@ -61,6 +61,7 @@ class GltfFormat:
 
     name: str
     needs: str | None = None
+    keeps: tuple[str, ...] = ("harmonics", "record")
 
     def sniff(self, path: Path, head: bytes) -> bool:
         """True for the magic of a .glb that is not called .spz.glb, and for the suffix .gltf of JSON."""

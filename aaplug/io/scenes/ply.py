@@ -44,7 +44,7 @@ ROWS_PER_WRITE = 1 << 13  # 2 MB, so that a column's stride stays within the cac
 
 name = "ply"
 needs = None
-keeps_extras = True
+keeps = ("harmonics", "record", "extras")
 
 
 def sniff(path: Path, head: bytes) -> bool:

@@ -101,12 +101,3 @@ def warn_of_sizes(path: Path, format: str, parts: Sequence[Gaussians], least: fl
     if odd > MOVED_SHARE * len(sizes):
         what = f"{odd:,} of {counted(len(sizes), 'Gaussian')} of another size than {ends[0]:.3g} to {ends[1]:.3g} units"
         log.warning("%s: a .%s cannot hold %s; scale the scene by aaplug merge, or write a .ply", path, format, what)
-
-
-def warn_of_losses(path: Path, format: str, scene: Gaussians, kept: Facts, also: Iterable[str] = ()) -> None:
-    """Name what a file does not tell of its scene's training, and other losses; `kept`: the facts that it tells."""
-    lost = list(also)
-    if scene.convention != kept.convention or scene.fused != kept.fused:
-        lost.append(f"the record of its training ({scene.convention.name})")
-    if lost:
-        log.warning("%s: a .%s cannot hold %s; a .ply can", path, format, " and ".join(lost))

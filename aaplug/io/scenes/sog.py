@@ -63,6 +63,7 @@ SPARE_PIXELS = 1 << 16  # pixels allowed beyond twice the number of Gaussians
 
 name = "sog"
 needs = None
+keeps = ("harmonics", "record")
 
 Fetch = Callable[[str, int], bytes]
 
@@ -252,7 +253,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 class _Unbundled:
     """The meta.json of a folder; it is read as `sog`."""
 
-    name, needs, read_as = META, None, name
+    name, needs, keeps, read_as = META, None, keeps, name
     open_scene, write = staticmethod(open_scene), staticmethod(write)
 
     @staticmethod

@@ -13,7 +13,7 @@ import torch
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, sh_of_colour
-from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
+from aaplug.io.scenes.record import holdable
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError
@@ -46,10 +46,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost, as a warning says."""
     with replacing(path, overwrite) as stream:
-        for number, part in enumerate(parts):
-            if not number:
-                lost = ["harmonics above degree 0"] if part.sh_degree else []
-                warn_of_losses(path, name, part, Facts(EVIDENCE), lost)
+        for part in parts:
             stream.write(_records(holdable(path, part, name, MOST_DEGREE)).tobytes())
         if not stream.tell():
             raise OutputError(path, "cannot hold a scene without Gaussians; write a .ply")

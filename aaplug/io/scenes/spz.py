@@ -32,7 +32,7 @@ from aaplug.core.placing import mirrored
 from aaplug.io.atomic import write_file
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, check_growth, floats, largest_last, without_largest
-from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves, warn_of_sizes
+from aaplug.io.scenes.record import holdable, warn_of_moves, warn_of_sizes
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
@@ -74,6 +74,7 @@ NAMED_AXES = {  # axes, and a note, by `spz_axes`
 
 name = "spz"
 needs = None
+keeps = ("harmonics", "compensation")
 
 
 @dataclass(frozen=True)
@@ -252,8 +253,6 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     axes, _ = NAMED_AXES["opengl" if options.spz_axes == "auto" else options.spz_axes]
     scenes = [_turned(part, axes) for part in parts]
     content = packed(path, scenes, options.spz_version, axes)
-    kept = Facts("", COMPENSATED if scenes[0].convention.compensated else CLASSIC)
-    warn_of_losses(path, name, scenes[0], kept)
     write_file(path, content, overwrite)
 
 

@@ -55,6 +55,7 @@ class UsdFormat:
 
     name: str
     needs: str | None = PACKAGE
+    keeps: tuple[str, ...] = ("harmonics", "record")
     extra: str = "usd"
 
     def sniff(self, path: Path, head: bytes) -> bool:
