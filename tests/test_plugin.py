@@ -15,7 +15,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -398,6 +398,16 @@ def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, 
     verdict = next(each for each in check_plugin("left") if each.problem)
     assert (verdict.kind, verdict.name, verdict.law) == ("metric", name, "Its entry point registers it.")
     assert verdict.problem.startswith(problem)
+
+
+def test_an_entry_point_of_an_unknown_group_is_a_broken_law(monkeypatch):
+    odd = [EntryPoint("odd", "left:odd", "aaplug.metric"), EntryPoint("odd", "other:odd", "aaplug.odd")]
+    usual = [point for group in entry_points().groups for point in entry_points(group=group)]
+    monkeypatch.setitem(sys.modules, "left", ModuleType("left"))
+    monkeypatch.setattr("aaplug.system.registry._points", lambda: EntryPoints([*usual, *odd]))
+    [verdict] = check_plugin("left")
+    assert verdict[:3] == ("entry point", "odd", "Its entry point registers it.")
+    assert verdict.problem.startswith("group aaplug.metric is not known; did you mean aaplug.metrics")
 
 
 def test_what_lacks_a_part_of_its_interface_is_told_it():

@@ -244,10 +244,16 @@ def _points_of(kind: str) -> tuple[EntryPoint, ...]:
 @cache
 def _warn_of_unknown_groups() -> None:
     """Tell of entry point groups that look like ours, once."""
-    groups = set(map(group_of, REGISTRIES))
-    for group in sorted(_points().groups):
-        if group.startswith(PREFIX) and group not in groups:
-            log.warning("entry point group %s is not known%s", group, did_you_mean(group, groups))
+    for problem in dict.fromkeys(of_unknown_groups().values()):
+        log.warning("entry point %s", problem)
+
+
+def of_unknown_groups() -> dict[EntryPoint, str]:
+    """Entry points of groups that look like ours, and why nothing reads them."""
+    known = set(map(group_of, REGISTRIES))
+    unknown = [group for group in sorted(_points().groups) if group.startswith(PREFIX) and group not in known]
+    problems = {group: f"group {group} is not known{did_you_mean(group, known)}" for group in unknown}
+    return {point: problem for group, problem in problems.items() for point in _points().select(group=group)}
 
 
 @cache

@@ -14,7 +14,7 @@ from aaplug.evaluation.laws import LAWS
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError, failure
 from aaplug.system.monitor import SILENT, Monitor
-from aaplug.system.registry import REGISTRIES, group_of, of_import, registry_of
+from aaplug.system.registry import REGISTRIES, group_of, of_import, of_unknown_groups, registry_of
 
 MAX_PROBLEM = 300  # characters of a broken law's message
 
@@ -60,8 +60,9 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
 
 def _left_out(package: str) -> Iterator[Verdict]:
     """What entry points of a package name and cannot be used."""
-    for kind in REGISTRIES:
-        for point, problem in registry_of(kind).left_out.items():
+    left_out = {kind: registry_of(kind).left_out for kind in REGISTRIES}
+    for kind, points in {**left_out, "entry point": of_unknown_groups()}.items():
+        for point, problem in points.items():
             if point.module.partition(".")[0] == package:
                 yield Verdict(kind, point.name, "Its entry point registers it.", problem)
 
