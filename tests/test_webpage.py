@@ -20,6 +20,8 @@ from markupsafe import escape
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import coverage
+from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.report import webpage
 from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size
 from aaplug.io.streamed import STREAMS
@@ -110,6 +112,18 @@ def test_tables_show_the_spread_and_the_worst_view_and_times_their_quartiles(wri
     assert str(escape(worst)) in text
     times = np.quantile([m.seconds for m in report.select("auto", 1.0)], (0.5, 0.25, 0.75))
     assert cell("seconds per view, median", "auto", 1.0)[1] == [f"{time:.3f}" for time in times]
+
+
+SPREAD = ("Means over the views", "standard deviation", "worst view", "median", "quartiles")
+
+
+@pytest.mark.parametrize(("views", "said"), [((NASTY, "b"), SPREAD), (("b",), ())])
+def test_the_figures_of_a_single_view_have_no_spread(written, views, said):
+    folder, report, bounds = written
+    measurements = tuple(m for m in report.measurements if m.view in views)
+    found = replace(report, measurements=measurements, protocol={**report.protocol, "views": len(views)})
+    text = webpage.page("some", found, bounds, [], ImageStore(folder, ()))
+    assert [words for words in SPREAD if words in text] == [*said]
 
 
 @pytest.fixture

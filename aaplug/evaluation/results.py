@@ -282,10 +282,12 @@ def cost_cells(report: Report) -> list[tuple[str, str, list[list[Cell]]]]:
         spread = f"± {number(stdev(millions), COUNT_DIGITS)}" if len(millions) > 1 else ""
         return Cell(number(_mean(millions), COUNT_DIGITS), spread=spread)
 
-    about = "rendering alone, on the machine that the protocol names; below, the quartiles over the views"
-    columns = [("seconds per view, median", about, time)]
+    several = report.protocol["views"] > 1
+    quartiles, deviation = (f"; below, the {of} over the views" * several for of in ("quartiles", "standard deviation"))
+    about = f"rendering alone, on the machine that the protocol names{quartiles}"
+    columns = [("seconds per view" + ", median" * several, about, time)]
     if any(m.evaluations is not None for m in report.measurements):
-        about = "splat-pixel evaluations of compositing; below, the standard deviation over the views"
+        about = f"splat-pixel evaluations of compositing{deviation}"
         columns.append(("million evaluations per view", about, evaluations))
     views = [[report.select(recipe, scale) for scale in report.scales] for recipe in report.recipes]
     return [(title, about, [[cell(each) for each in row] for row in views]) for title, about, cell in columns]
