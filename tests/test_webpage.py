@@ -57,6 +57,11 @@ def test_the_page_refers_to_nothing_outside_itself(written):
     assert "default-src 'none'" in text
 
 
+def test_no_two_parts_of_the_page_have_one_id(written):
+    ids = re.findall(r"<[^>]*\sid=\"([^\"]*)\"", (written[0] / "report.html").read_text())
+    assert len(ids) == len(set(ids)) > 20
+
+
 def test_every_name_is_escaped_and_the_best_is_bold(written):
     text = (written[0] / "report.html").read_text()
     assert "<script>alert" not in text

@@ -33,7 +33,6 @@ INK_SETTINGS = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color"
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.fonttype": "none",
-    "svg.hashsalt": "aaplug",
     "font.size": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -71,7 +70,7 @@ class Plot:
 
     def _saved(self, kind: str, ink: str, **settings: Any) -> bytes:
         stream, parts = io.BytesIO(), dict.fromkeys(INK_SETTINGS, ink)
-        with mpl.rc_context({**STYLE, **parts}):
+        with mpl.rc_context({**STYLE, **parts, "svg.hashsalt": self.name}):  # ids of several figures differ in a page
             self.draw(ink).savefig(stream, format=kind, bbox_inches="tight", **settings)
         return stream.getvalue()
 
