@@ -364,7 +364,7 @@ def test_a_page_has_the_viewer_beside_it(tmp_path, monkeypatch):
     assert not list((tmp_path / "out").glob("*.ply"))
 
 
-def test_a_viewer_beside_a_page_has_no_more_than_the_page_needs(tmp_path):
+def test_beside_a_page_is_no_more_than_it_needs(tmp_path):
     cesium = tmp_path / "modules" / "cesium" / "Build" / "Cesium"
     needed = {"Cesium.js", "Assets/a.json", "ThirdParty/a.wasm", "Workers/a.js"}
     for name in {*needed, "index.js", "index.cjs", "Widgets/widgets.css"}:
@@ -373,6 +373,7 @@ def test_a_viewer_beside_a_page_has_no_more_than_the_page_needs(tmp_path):
     made(tmp_path / "out", "3dtiles", page=tmp_path / "modules")
     viewer = tmp_path / "out" / "viewer"
     assert {path.relative_to(viewer).as_posix() for path in viewer.rglob("*") if path.is_file()} == needed
+    assert [path.name for path in (tmp_path / "out").glob("*.js")] == ["problems.js"]
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path):

@@ -277,8 +277,12 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
                 shutil.copy(program, viewer)
     except OSError as error:
         raise OutputError(viewer, f"cannot be written: {reason(error)}") from error
-    for file, source in [*((script, script) for script in PAGE_SCRIPTS), (PAGE, f"{name}.html")]:
-        write_file(folder / file, files(stream_pages).joinpath(source).read_bytes(), overwrite=True)
+    source = files(stream_pages)
+    page = source.joinpath(f"{name}.html").read_bytes()
+    for script in PAGE_SCRIPTS:
+        if script.encode() in page:
+            write_file(folder / script, source.joinpath(script).read_bytes(), overwrite=True)
+    write_file(folder / PAGE, page, overwrite=True)
 
 
 Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's settings
