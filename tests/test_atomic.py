@@ -102,15 +102,17 @@ def test_permissions_follow_the_umask_and_a_link_stays_a_link(output: Path, tmp_
         ("x" * 300, "cannot be written"),
         ("nul\0", "cannot be written"),
         ("pipe", "not an ordinary file"),
+        ("loop", "is a link that leads to itself"),
     ],
 )
 def test_impossible_outputs_are_refused(output: Path, name: str, problem: str):
     os.mkfifo(output.parent / "pipe")
+    (output.parent / "loop").symlink_to("loop")
     with pytest.raises(OutputError, match=problem):
         write(output.parent / name, NEW, overwrite=True)
     with pytest.raises(OutputError, match=problem):
         check_output(output.parent / name, True)
-    assert sorted(output.parent.iterdir()) == [output.parent / "pipe", output]
+    assert sorted(output.parent.iterdir()) == [output.parent / "loop", output.parent / "pipe", output]
     assert output.read_bytes() == OLD
 
 

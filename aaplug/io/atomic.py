@@ -142,7 +142,10 @@ def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ())
             raise OutputError(path, "is not an ordinary file")
         if path.exists() and not overwrite:
             raise OutputError(path, "exists; pass `overwrite` to replace it")
-        above = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
+        target = Path(os.path.realpath(path))
+        if target.is_symlink():
+            raise OutputError(path, "is a link that leads to itself")
+        above = next(parent for parent in target.parents if parent.exists())
         if not above.is_dir():
             raise OutputError(path, f"cannot be written: {above} is no folder")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
