@@ -175,6 +175,7 @@ REFUSED = {
     "a.png --bit-depth 32": "--bit-depth: a .png has 8 or 16 bits per channel, not 32",
     "a.png --format exr": "--format: is exr, but a.png is named as a .png",
     "a.png --transparent --background white": "--background: is not stored where alpha is",
+    "a.npz --passes depth --background white": "--background: is of the pass rgb, which --passes leaves out",
     "a.gif": "name a folder, or one .png",
     "a.mp4": "name a folder, or one .png",
 }

@@ -110,11 +110,13 @@ def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) ->
 def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
     """How images are stored, and the options; those for images with alpha have no background.
 
-    Raises UsageError if the format does not hold what is asked for, or there is to be a background and alpha.
+    Raises UsageError if the format does not hold what is asked for, or there is to be a background and alpha or no rgb.
     """
     passes = [options.passes] if isinstance(options.passes, str) else options.passes
     stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)
     storage = Storage.of(output, options.format, passes, *stored)
+    if options.background != "auto" and "rgb" not in storage.passes:
+        raise UsageError("background", "is of the pass rgb, which `passes` leaves out")
     if "alpha" not in storage.passes:
         return storage, options
     if options.background != "auto":
