@@ -1,7 +1,9 @@
 """Cameras from every format: values checked by hand, one scene in all its formats, and hostile files."""
 
+import errno
 import json
 import math
+import os
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -522,6 +524,20 @@ def test_each_axis_of_transforms_has_its_focal_length_or_angle(tmp_path, lens, f
     del document["camera_angle_x"]
     (camera,) = read_cameras(write_json(tmp_path / "transforms.json", document | {"w": 40, "h": 20})).train
     assert (camera.fx, camera.fy) == pytest.approx(focals)
+
+
+@pytest.mark.parametrize("make", [colmap_bin, blender])
+def test_a_folder_of_photos_that_may_not_be_looked_into_is_refused(tmp_path, monkeypatch, make):
+    make(tmp_path)
+    looked = os.stat
+
+    def denied(path, **how):
+        if isinstance(path, Path) and path.parent.name in ("images", "train"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return looked(path, **how)
+
+    monkeypatch.setattr(os, "stat", denied)
+    refused(tmp_path, "cannot be looked into: permission denied")
 
 
 def test_what_is_not_read_beside_the_cameras_is_told(tmp_path):

@@ -1,11 +1,12 @@
 """Photos of cameras, found by name and never outside their dataset's folder; and names of views.
 
-Functions raise FormatError for names that lead out of the dataset or are there twice, and UsageError for a folder that
-the user chose in vain.
+Functions raise FormatError for names that lead out of the dataset or are there twice and for a folder that may not be
+looked into, and UsageError for a folder that the user chose in vain.
 """
 
 import os
 import re
+import stat
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.values import Place
-from aaplug.system.errors import FormatError, UsageError, listing
+from aaplug.system.errors import FormatError, UsageError, listing, reason
 
 CAMERA_FILE = re.compile(  # of any format
     r"(dataparser_)?transforms.*\.json|(cameras|metadata)\.json|cfg_args|poses_bounds\.npy|(cameras|images|points3D)\..*"
@@ -43,7 +44,7 @@ class PhotoFolder:
         """The photo of that name, or of that name with another suffix, if there is one."""
         _refuse_escape(name, place)
         tries = (name, *(without_suffix(name) + suffix for suffix in COMMON_SUFFIXES))
-        photo = next((path for path in (self.folder / t for t in tries) if os.path.isfile(path)), None)
+        photo = next((path for path in (self.folder / t for t in tries) if _is_file(path)), None)
         if photo is None:
             return None
         try:
@@ -107,6 +108,16 @@ def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
         for each in filter(lambda path: names.fullmatch(path.name), beside):
             files += [file for file in _listed(each) if file.suffix.lower() in SUFFIXES]
     return tuple(dict.fromkeys(files))
+
+
+def _is_file(path: Path) -> bool:
+    """As `os.path.isfile`, but raises FormatError for a folder that may not be looked into."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except PermissionError as error:
+        raise FormatError(path.parent, f"cannot be looked into: {reason(error)}") from error
+    except (OSError, ValueError):
+        return False
 
 
 def _listed(folder: Path) -> list[Path]:
