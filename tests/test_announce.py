@@ -9,6 +9,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.splats import Render
 from aaplug.finetuning.settings import Settings
 from aaplug.io import limits
+from aaplug.io.limits import SAMPLE_BYTES
 from aaplug.methods.recipe import MAX_SAMPLES
 from aaplug.options.shared import Orbit
 from aaplug.options.verbs import RenderOptions
@@ -16,7 +17,7 @@ from aaplug.rendering import job as jobs
 from aaplug.rendering.assumed import CROP_SAMPLES
 from aaplug.rendering.cost import EAGER, GRADIENTS, cost_of
 from aaplug.rendering.job import Job
-from aaplug.rendering.renderer import SAMPLE_BYTES, Drawing, Renderer
+from aaplug.rendering.renderer import Drawing, Renderer
 from aaplug.system import groups
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import Monitor

@@ -869,6 +869,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "rasterize_mode: 'mip' is not one of classic, antialiased, matched": {"rasterize_mode": "mip"},
     "near_plane: expected a number above 0, got 0.0": {"near_plane": 0.0},
     "width: expected an integer from 1 to 2.14748e+09, got 0": {"width": 0},
+    "width: 200000x200000 would take 1280.0 GB, more than": {"width": 200_000, "height": 200_000},
     "eps2d: expected a number from 0 to 1e+06, got -0.1": {"eps2d": -0.1},
     "eps2d: expected a number from 0 to 1e+06, got inf": {"eps2d": math.inf},
     "max_alpha: expected a number above 0.00392157 to 0.999999, got 1.0": {"max_alpha": 1.0},
@@ -905,6 +906,7 @@ WRONG = {  # "[*b" stands for a tensor of floats
 
 
 WRONG_FOR_DISCS = {
+    "width: 200000x200000 would take 1280.0 GB, more than": {"width": 200_000, "height": 200_000},
     "depth_mode: 'mean' is not one of expected, median": {"depth_mode": "mean"},
     "absgrad: only False is supported": {"absgrad": True},
     "quats: expected a tensor": {"quats": None},

@@ -18,6 +18,7 @@ from aaplug.core.conventions import Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens, opencv_lens
 from aaplug.core.rules import Rules
+from aaplug.io.limits import lack_for_samples
 from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError, not_one_of
 
@@ -78,7 +79,7 @@ class Options:
     """The arguments of a call beside its tensors; names and units as in `rasterization`.
 
     Raises:
-        UsageError: a mode is not known.
+        UsageError: a mode is not known, or memory does not hold an image.
     """
 
     width: int
@@ -100,6 +101,8 @@ class Options:
         for name, modes in MODES.items():
             if getattr(self, name) not in modes:
                 raise UsageError(name, not_one_of(getattr(self, name), modes))
+        if lacking := lack_for_samples(self.width * self.height):
+            raise UsageError("width", f"{self.width}x{self.height} would take {lacking}; a smaller image needs less")
 
     @property
     def hw(self) -> tuple[int, int]:

@@ -123,8 +123,8 @@ def rasterization(
         except those of its tiles.
 
     Raises:
-        UsageError: something is not supported or out of range, shapes do not fit each other, or no compiled kernel
-            takes what "compiled" was asked for.
+        UsageError: something is not supported or out of range, shapes do not fit each other, memory does not hold an
+            image, or no compiled kernel takes what "compiled" was asked for.
     """
     options = Options(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, None if colors is None else sh_degree),

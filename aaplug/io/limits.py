@@ -15,6 +15,8 @@ from typing import NamedTuple
 from aaplug.system import groups
 from aaplug.system.errors import UsageError
 
+SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
+UNCHECKED_SAMPLES = 1 << 26  # of an image, up to which memory is not checked
 STATM = Path("/proc/self/statm")  # pages of memory that it uses
 
 
@@ -71,6 +73,11 @@ def lack_of_memory(needed: int | float) -> str | None:
     if memory is None or needed <= share * memory.bytes:
         return None
     return f"{needed / 1e9:.1f} GB, more than {share:.0%} of {memory}"
+
+
+def lack_for_samples(count: int) -> str | None:
+    """The reason that this process cannot hold an image of so many samples, as `lack_of_memory`."""
+    return lack_of_memory(SAMPLE_BYTES * count) if count > UNCHECKED_SAMPLES else None
 
 
 class Memory(NamedTuple):

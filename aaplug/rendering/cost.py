@@ -8,7 +8,8 @@ from operator import mul
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
-from aaplug.rendering.renderer import SAMPLE_BYTES, Renderer
+from aaplug.io.limits import SAMPLE_BYTES
+from aaplug.rendering.renderer import Renderer
 
 COMPILED = 0.19e-6, 0.047e-6  # seconds per Gaussian of the scene, and per sample of the image
 EAGER = 0.64e-6, 0.29e-6

@@ -37,7 +37,7 @@ from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import Margin, TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import colour_of
-from aaplug.io.limits import lack_of_memory
+from aaplug.io.limits import lack_for_samples
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.scene import Scene, SceneFrames, without_harmonics
 from aaplug.methods.filters.matched import Matched
@@ -55,8 +55,6 @@ from aaplug.system.errors import UsageError, not_one_of, within_memory
 from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
-SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
-UNCHECKED_SAMPLES = 1 << 26  # of an image, up to which memory is not checked
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -247,8 +245,7 @@ class Renderer:
     def _fine(self, camera: Camera, samples: int) -> Camera:
         """The camera of the supersampled image; raises UsageError where memory does not suffice."""
         width, height = camera.width * samples, camera.height * samples
-        pixels = width * height
-        if pixels > UNCHECKED_SAMPLES and (lacking := lack_of_memory(SAMPLE_BYTES * pixels)):
+        if lacking := lack_for_samples(width * height):
             problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
             raise UsageError(f"view {camera.name} at {camera.width}x{camera.height}", problem)
         return camera if samples == 1 else camera.resized(width, height)
