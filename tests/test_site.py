@@ -82,8 +82,13 @@ def test_a_figure_of_tables_or_formulas_is_the_committed_one(plot, least):
     def curves(svg: str) -> list[str]:
         return re.findall(r'<path d="(M [^"]*)" clip-path', svg)
 
-    drawn, committed = curves(plot.svg()), curves((FOLDER / f"{plot.name}.svg").read_text())
+    def words(svg: str) -> list[str]:
+        return re.findall(r"<text [^>]*>([^<]+)</text>", svg)
+
+    now, then = plot.svg(), (FOLDER / f"{plot.name}.svg").read_text()
+    drawn, committed = curves(now), curves(then)
     assert drawn == committed
+    assert words(now) == words(then) != []
     assert len(drawn) >= least
 
 

@@ -50,7 +50,7 @@ def _merging(axes: Axes, ink: str) -> None:
     errors = [error(cell) for cell in CELLS]
     axes.plot(CELLS, errors, marker="o", ms=4, color=COLOURS[0], label="largest of 40 random cells")
     axes.plot(CELLS, LARGEST_THIRD * CELLS**3 / 6, color=ink, ls=(0, (4, 3)), lw=1, label="a₃ (h/s)³ / 6")
-    axes.set(xlabel="cell h against filter s", ylabel="error of the light", title="Statement 6")
+    axes.set(xlabel="cell h against filter s", ylabel="error of the light, over its peak", title="Statement 6")
     _labelled(axes, CELLS, ink)
 
 
