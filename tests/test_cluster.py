@@ -184,13 +184,13 @@ def answering(text: bytes) -> Iterator[str]:
 
 def test_what_answers_and_is_no_scheduler_is_told(local, tmp_path, monkeypatch):
     local.client.wait_for_workers(1)  # another test may have killed it
-    monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
     with answering(b"") as silent, answering(b"HTTP/1.0") as page:
-        for address, problem in (
-            (silent, "nothing answers there within 0 s"),
-            (page, "what answers there is not Dask"),
-            (min(local.client.nthreads()), "a Dask worker answers there, expected a scheduler"),
+        for address, problem, seconds in (
+            (page, "what answers there is not Dask", cluster.ANSWER_SECONDS),
+            (min(local.client.nthreads()), "a Dask worker answers there, expected a scheduler", cluster.ANSWER_SECONDS),
+            (silent, "nothing answers there within 0 s", 0.2),
         ):
+            monkeypatch.setattr(cluster, "ANSWER_SECONDS", seconds)
             with pytest.raises(ClusterError, match=f"scheduler {address}: {problem}"):
                 cluster.connected(address, 0, tmp_path, SILENT).__enter__()
 
