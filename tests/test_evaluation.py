@@ -107,6 +107,7 @@ def test_work_without_a_truth_empty_or_doubled_is_refused(look, views):
         (views, {"recipes": ("auto", "auto")}, "a recipe is named twice"),
         (bare, {}, "a: has no photograph"),
         (views, {"protocol": "fov"}, "moves the camera"),
+        (views, {"protocol": "blender", "scales": (1.0, 0.3)}, "scale: 0.3 is not a power of 1/2"),
     ):
         with pytest.raises(UsageError, match=words):
             task(look, given, **changes)

@@ -27,6 +27,7 @@ from aaplug.evaluation.metric import Image, Metric, Series, TimedImage, TimedRen
 from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
+from aaplug.io.images import image_size
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.cost import COMPARED, Cost, cost_of
@@ -73,7 +74,10 @@ class Task:
     ceiling: bool = True
 
     def __post_init__(self) -> None:
-        """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs."""
+        """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs.
+
+        So does a scale to which the protocol does not downscale photographs.
+        """
         if not (self.renderers and self.scales and self.views):
             raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
         for each in self.renderers.values():
@@ -85,6 +89,12 @@ class Task:
             raise UsageError("evaluate", "a recipe or a scale is named twice")
         if self.truth.source == "photographs":
             source_of(self.views, "photographs", self.truth.protocol)
+            if check := DOWNSCALES[self.truth.protocol.downscale].check:
+                undistorted = [(v.width, v.photo) for v in self.views if v.photo and v.undistortion is None]
+                sizes = {width / image_size(photo)[0] for width, photo in undistorted}
+                for factor in (size * scale for size, scale in product(sizes, self.scales)):
+                    if factor <= 1:
+                        check(factor)
 
     @property
     def measured(self) -> tuple[Metric, ...]:

@@ -55,10 +55,14 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Downscale:
-    """A downscaling method; `protocol` describes it for reports."""
+    """A downscaling method; `protocol` describes it for reports.
+
+    check: raises UsageError for a factor, up to 1, that the method does not take; None if it takes all.
+    """
 
     protocol: str
     read: Callable[[Path, Background, Undistortion | None], Photograph]
+    check: Callable[[float], object] | None = None
 
 
 def read_photo(
@@ -84,16 +88,20 @@ def _box(path: Path, background: Background, undistortion: Undistortion | None =
     return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factors: resampled(photo, factors, hw))
 
 
+def _halvings(factor: float) -> int:
+    count = round(math.log2(1 / factor))
+    if abs(factor * 2**count - 1) > WHOLE_SLACK:
+        raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
+    return count
+
+
 def _rgba_box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
     """Mip-NeRF's multi-scale Blender data: RGBA halved in float, truncated to 8 bits when saved and when composited."""
     halves = [undistorted(read_rgba(path), undistortion)]
     behind = torch.tensor(background)
 
     def at(hw: tuple[int, int], factors: Factors) -> Float[Tensor, "h w 3"]:
-        factor = factors[1]
-        depth = round(math.log2(1 / factor))
-        if abs(factor * 2**depth - 1) > WHOLE_SLACK:
-            raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
+        depth = _halvings(factors[1])
         while len(halves) <= depth:
             halves.append(box_average(halves[-1], 2))
         saved = truncated(halves[depth])[: hw[0], : hw[1]]
@@ -124,6 +132,6 @@ RGBA_BOX = "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, c
 PIL_BICUBIC = "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)"
 DOWNSCALES = {
     "box": Downscale(BOX, _box),
-    "rgba-box": Downscale(RGBA_BOX, _rgba_box),
+    "rgba-box": Downscale(RGBA_BOX, _rgba_box, _halvings),
     "pil-bicubic": Downscale(PIL_BICUBIC, _pil_bicubic),
 }
