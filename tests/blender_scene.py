@@ -111,6 +111,11 @@ if len(sys.argv) > 3:
     result["no program"] = refused(program="no-such-program")
     result["not saved"] = refused(folder="//aaplug")
     result["no splats"] = refused(splats="")
+    scene.render.use_border = True  # whose whole frame lies where Blender's does
+    result["region"] = addon.camera_path(scene, frames[:1])["render_width"]
+    scene.render.use_crop_to_border = True
+    result["cropped"] = refused(splats="a.ply", folder=str(folder))
+    scene.render.use_border = False
     origin.scale, scene.aaplug.frame = (1, 2, 2), origin
     bpy.context.view_layer.update()
     result["stretched"] = refused(splats="a.ply", folder=str(folder))

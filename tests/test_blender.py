@@ -83,6 +83,8 @@ def test_frames_are_drawn_and_loaded(exported):
     assert "false ended with status 1" in result["silent"]
     assert "Folder: save the .blend file first" in result["not saved"]
     assert "Splats: choose a scene" in result["no splats"]
+    assert result["region"] == 640
+    assert "Crop to Render Region: aaplug draws the whole frame; switch it off" in result["cropped"]
     assert "Frame: its scale should be the same along all axes" in result["stretched"]
 
 

@@ -31,10 +31,12 @@ NAME = "aaplug"  # of the image, its background and its node
 def camera_path(scene, frames):
     """The path file's content for these frame numbers; the scene keeps its current frame.
 
-    Raises ValueError for a camera that has no perspective lens or no distance in focus, and for a Frame that stretches
-    or mirrors.
+    Raises ValueError for a camera that has no perspective lens or no distance in focus, for a Frame that stretches or
+    mirrors, and for images that Blender crops.
     """
     render, current, subframe = scene.render, scene.frame_current, scene.frame_subframe
+    if render.use_border and render.use_crop_to_border:
+        raise ValueError("Crop to Render Region: aaplug draws the whole frame; switch it off")
     scale = render.resolution_percentage / 100
     size = max(1, int(render.resolution_x * scale)), max(1, int(render.resolution_y * scale))
     try:
