@@ -41,7 +41,7 @@ from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError, PlugInError, UsageError
-from aaplug.system.registry import Registry
+from aaplug.system.registry import Registry, _points_of
 from aaplug.system.signals import _exit
 from aaplug.verbs.check_plugin import check_plugin
 from aaplug.verbs.evaluate import evaluate
@@ -394,7 +394,9 @@ def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, 
     metrics = Registry("metric", "aaplug.evaluation.metric:Metric", {"PSNR": METRICS["PSNR"]})
     monkeypatch.setattr("aaplug.evaluation.METRICS", metrics)
     point = EntryPoint(name, f"left:{object}", "aaplug.metrics")
-    monkeypatch.setattr("aaplug.system.registry._points_of", lambda kind: (point,) * (kind == "metric"))
+    monkeypatch.setattr(
+        "aaplug.system.registry._points_of", lambda kind: (point,) if kind == "metric" else _points_of(kind)
+    )
     verdict = next(each for each in check_plugin("left") if each.problem)
     assert (verdict.kind, verdict.name, verdict.law) == ("metric", name, "Its entry point registers it.")
     assert verdict.problem.startswith(problem)
