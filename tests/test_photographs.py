@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from aaplug.core.imaging import box_average, quantised, stretched
+from aaplug.core.imaging import box_average, quantised, resampled, stretched
 from aaplug.io.images import read_image
 from aaplug.io.photographs import DOWNSCALES, photo_of
 from aaplug.system.errors import UsageError
@@ -78,3 +78,14 @@ def test_a_view_trained_at_a_rounded_size_is_compared_with_the_whole_photograph(
     whole = quantised(read_image(rgba, WHITE))
     assert torch.allclose(photo_of(view, WHITE)(view), stretched(whole, (6, 10)), atol=1e-6)
     assert torch.allclose(photo_of(view, WHITE)(view.scaled(1 / 2)), stretched(whole, (3, 5)), atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.35, 2 / 3 + 1e-3, 1.7])
+def test_a_partial_pixel_that_is_cropped_moves_no_other(factor):
+    """Of a ramp, each pixel is the average over its own part, or about the value at its centre if it is smaller."""
+    edges = np.arange(int(11 * factor) + 1) / factor
+    averages = np.diff(np.interp(edges, np.arange(12), np.cumsum([0, *range(11)]))) * factor
+    expected = averages if factor < 1 else ((edges[:-1] + edges[1:]) / 2 - 0.5).clip(0, 10)
+    ramp = torch.arange(11.0)[:, None, None].expand(11, 11, 3)
+    for found in (resampled(ramp, factor)[:, 2, 1], resampled(ramp.transpose(0, 1), factor)[2, :, 1]):
+        assert np.abs(found.numpy() - expected).max() < (1e-5 if factor < 1 else 0.12)

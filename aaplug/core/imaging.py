@@ -6,7 +6,6 @@ Images are [h, w, 3] in [0, 1].  A factor is the density of the new pixels again
 import math
 from functools import reduce
 
-import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -86,13 +85,16 @@ def resampled(
         if box > min(height, width):
             raise UsageError("scale", f"{columns:g} leaves no pixel of a {width}x{height} image")
         return box_average(rgb, box)[: hw[0], : hw[1]]
-    source = rgb[: math.ceil(hw[0] / rows - WHOLE_SLACK), : math.ceil(hw[1] / columns - WHOLE_SLACK)]
-    return _resized(source, hw, cv2.INTER_AREA if columns < 1 else cv2.INTER_CUBIC)
+    if columns < 1:
+        return _averaged(_averaged(rgb, rows, hw[0]), columns, hw[1])
+    factors = rows * (1 + WHOLE_SLACK / height), columns * (1 + WHOLE_SLACK / width)  # a side is cut to whole pixels
+    planes = functional.interpolate(rgb.permute(2, 0, 1)[None], scale_factor=factors, mode="bicubic")[0]
+    return planes.permute(1, 2, 0)[: hw[0], : hw[1]].contiguous()
 
 
 def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
-    """Resize the whole image to `hw`: area-weighted averages to fewer rows, bicubic to more."""
-    return _resized(rgb, hw, cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC)
+    """Resize the whole image to `hw`: area-weighted averages to fewer columns, bicubic to more."""
+    return resampled(rgb, (hw[0] / rgb.shape[0], hw[1] / rgb.shape[1]), hw)
 
 
 def quantised(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -120,5 +122,12 @@ def _pooled(image: Float[Tensor, "h w c"], n: int, neighbours: float = 0.0) -> F
     return image / n**2
 
 
-def _resized(rgb: Tensor, hw: tuple[int, int], kernel: int) -> Tensor:
-    return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
+def _averaged(image: Float[Tensor, "h w c"], factor: float, count: int) -> Float[Tensor, "w n c"]:
+    """The first `count` means over 1/factor rows, which need not be whole; as columns."""
+    edges = torch.arange(count + 1, dtype=torch.float64, device=image.device)[:, None] / factor
+    start, end = edges[:-1], edges[1:]
+    rows = start.floor() + torch.arange(math.ceil(1 / factor) + 1, device=image.device)
+    shares = factor * (torch.minimum(end, rows + 1) - torch.maximum(start, rows)).clamp(min=0)
+    rows = rows.long().clamp(max=len(image) - 1)
+    means = functional.embedding_bag(rows, image.flatten(1), per_sample_weights=shares.to(image), mode="sum")
+    return means.view(count, *image.shape[1:]).transpose(0, 1).contiguous()
