@@ -114,9 +114,9 @@ def test_an_orientation_tag_moves_no_pixel(tmp_path: Path):
     assert (got[:, :12] > 0.9).all()
 
 
-@pytest.mark.parametrize("mode", ["CMYK", "LA", "RGBA", "F"])
-def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str):
-    Image.new(mode, (4, 4)).save(tmp_path / "a.tiff")
+@pytest.mark.parametrize(("mode", "orientation"), [("CMYK", 1), ("LA", 1), ("RGBA", 1), ("F", 1), ("RGB", 3), ("L", 6)])
+def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str, orientation: int):
+    Image.new(mode, (4, 4)).save(tmp_path / "a.tiff", tiffinfo={0x0112: orientation})
     with pytest.raises(FormatError, match="save it"):
         read_image(tmp_path / "a.tiff", WHITE)
 

@@ -1,8 +1,8 @@
 """Image files as float tensors, and tensors as PNG and WebP.
 
 Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] as stored (gamma-encoded).  Bit depths
-are 8 or 16.  Orientation tags are ignored: cameras were calibrated on the pixels as they stand in the file.  An
-animation is its still picture or first frame, a file of several pictures its first.
+are 8 or 16.  Orientation tags are ignored, those of a TIFF refused: cameras were calibrated on the pixels as they stand
+in the file.  An animation is its still picture or first frame, a file of several pictures its first.
 
 Readers raise FormatError for a file that is missing, not an image of `FORMATS`, damaged, or above the limits IMAGE and
 IMAGE_EXTRA.  Memory is bounded by the limits before anything is decoded: by the size in the header that Pillow reads,
@@ -42,6 +42,7 @@ ROWS_PER_BAND = 64  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
 MAX_PIXEL_SIZE = 8  # bytes: four channels of 16 bits
+TIFF_ORIENTATION = 274  # tag Orientation; 1 turns nothing
 TIFF_ALPHA = 338  # tag ExtraSamples
 PREMULTIPLIED, STRAIGHT = 1, 2  # its values
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -151,7 +152,8 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
             size, transparent = header.size, header.has_transparency_data
-            alpha = getattr(header, "tag_v2", {}).get(TIFF_ALPHA, (0,))[-1]
+            tags = getattr(header, "tag_v2", {})
+            alpha, orientation = tags.get(TIFF_ALPHA, (0,))[-1], tags.get(TIFF_ORIENTATION, 1)
             stored = path.stat().st_size
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
@@ -161,6 +163,8 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
         raise FormatError(path, f"is not an image that can be read ({listing(FORMATS)})") from error
     finally:
         Image.MAX_IMAGE_PIXELS = pillow_limit
+    if orientation != 1:
+        raise FormatError(path, f"has the tag Orientation {orientation}, by which OpenCV turns a TIFF; save it without")
     pixels, most = size[0] * size[1], whole_limit("IMAGE")  # an image above it counts as a decompression bomb
     if pixels > most:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
