@@ -319,6 +319,15 @@ def test_colmap_trains_at_the_size_of_its_photos(tmp_path):
     assert (scaled.width, scaled.fx) == (200, 125)
 
 
+@pytest.mark.parametrize("file", ["写真\u3000é.webp", "写真\u3000e\u0301.jpg", "写真\u3000é.TIF"])
+def test_a_photo_is_found_by_another_suffix_or_spelling(tmp_path, file):
+    """Files may be converted after COLMAP ran, and macOS writes an accent as a letter of its own."""
+    views = ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "写真\u3000é.jpg"),)
+    photo(tmp_path / "images" / file, 400, 200)
+    for write in (colmap_bin, colmap_txt):
+        assert read_cameras(write(tmp_path / "sparse", images=views)).train[0].photo == tmp_path / "images" / file
+
+
 def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
     views = tuple((i, (1.0, 0, 0, 0), (0.0, 0, 0), 1, f"a.{s}") for i, s in enumerate(["jpg", "png"]))
     assert names(read_cameras(colmap_bin(tmp_path, images=views)).all) == ["a.png", "a.jpg"]
@@ -666,6 +675,11 @@ def test_nerfstudios_lists_are_the_split(tmp_path):
     ]:
         cameras = read_cameras(write_json(path, transforms(frames, w=40, h=20, **changed)))
         assert (names(cameras.train), names(cameras.test)) == (train, test)
+    more = {"test_frames": [{"transform_matrix": OPENGL, "file_path": "d.png"}]}  # ScanNet++
+    cameras = read_cameras(write_json(path, transforms(frames, w=40, h=20, **more)))
+    assert (names(cameras.train), names(cameras.test)) == (["a", "b", "c"], ["d"])
+    write_json(path, transforms(frames, w=40, h=20, test_frames=[{"file_path": "d.png"}]))
+    refused(path, "test frame 0: transform_matrix is missing")
     write_json(path, transforms(frames, w=40, h=20, **lists | {"train_filenames": "a.png"}))
     refused(path, "train_filenames should be a list")
     write_json(path, transforms(frames, w=40, h=20, val_filenames=["b.jpg"]))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import MAX_FOCAL
 from aaplug.io.limits import whole_limit
-from aaplug.system.errors import FormatError, reason
+from aaplug.system.errors import FormatError, printable, reason
 
 Value = TypeVar("Value")
 
@@ -125,7 +125,7 @@ def pixels(value: object, place: Place, field: str) -> int:
 
 def text(value: object, place: Place, field: str) -> str:
     """`value` as printable text: no control characters reach a terminal or a path."""
-    if not isinstance(value, str) or not value or not value.isprintable():
+    if not isinstance(value, str) or not value or printable(value) != value:
         raise place.wrong(field, "printable text", value)
     return value
 

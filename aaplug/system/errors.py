@@ -13,9 +13,11 @@ from os import PathLike
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType
+from unicodedata import category
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
 START_AGAIN = "start again with `overwrite`, not `resume`"  # where what is there cannot be continued
+SPACE = "Zs"  # Unicode's category of spaces, such as the ideographic one
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
@@ -106,7 +108,7 @@ def _like(name: str, names: Sequence[str]) -> str:
 
 def printable(text: str) -> str:
     """The text with control characters, which command a terminal, in escaped form."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return "".join(c if c.isprintable() or category(c) == SPACE else repr(c)[1:-1] for c in text)
 
 
 def reason(error: Exception) -> str:

@@ -12,20 +12,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from unicodedata import normalize
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.values import Place
-from aaplug.system.errors import FormatError, UsageError, listing, reason
+from aaplug.system.errors import FormatError, UsageError, listing, printable, reason
 
 CAMERA_FILE = re.compile(  # of any format
     r"(dataparser_)?transforms.*\.json|(cameras|metadata)\.json|cfg_args|poses_bounds\.npy|(cameras|images|points3D)\..*"
 )
 MASKS = "masks"  # a folder beside those of photos
 PHOTO_FOLDERS = (re.compile("train|test|val"), re.compile(r"images(_\d+)?"))  # that data sets have beside each other
-COMMON_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
+READ_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MASKED = "masks are not read: metrics count every pixel of the photos"
-SUFFIXES = (*COMMON_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
+SUFFIXES = (*READ_SUFFIXES, ".exr")  # of image files
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,13 @@ class PhotoFolder:
     chosen: bool = False
 
     def find(self, name: str, place: Place) -> Path | None:
-        """The photo of that name, or of that name with another suffix, if there is one."""
+        """The photo of that name, or of that name with another suffix or spelling, if there is one."""
         _refuse_escape(name, place)
-        tries = (name, *(without_suffix(name) + suffix for suffix in COMMON_SUFFIXES))
-        photo = next((path for path in (self.folder / t for t in tries) if _is_file(path)), None)
+        suffixes = (*READ_SUFFIXES, *map(str.upper, READ_SUFFIXES))
+        tries = (name, *(without_suffix(name) + suffix for suffix in suffixes))
+        # some systems and archives write an accent as a letter of its own, or together with its letter
+        spelt = dict.fromkeys((*tries, *(normalize(form, each) for each in tries for form in ("NFC", "NFD"))))
+        photo = next((path for path in (self.folder / each for each in spelt) if _is_file(path)), None)
         if photo is None:
             return None
         try:
@@ -151,5 +155,5 @@ def distinct(file: Path, names: Sequence[str], forms: Sequence[Callable[[str], s
 def _refuse_escape(name: str, place: Place) -> None:
     """Apply the path rules of POSIX and Windows, so that a file is accepted or refused on every system."""
     kinds = PurePosixPath(name), PureWindowsPath(name)
-    if not name.isprintable() or any(kind.anchor or ".." in kind.parts for kind in kinds):
+    if printable(name) != name or any(kind.anchor or ".." in kind.parts for kind in kinds):
         raise place.error(f"path {name!r} should stay within the dataset: no '..', not absolute")

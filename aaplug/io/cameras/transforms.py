@@ -40,6 +40,7 @@ FISHEYE = "OPENCV_FISHEYE"
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 MIN_ANGLE = 1e-9  # rad: the smallest angle of view
+TEST_FRAMES = "test_frames"  # ScanNet++'s split
 FILE_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's split
 MASK = "mask_path"
 DATAPARSER = "dataparser_transforms.json"
@@ -71,7 +72,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of one file."""
     file = path / FILE if os.path.isdir(path) else path
     source = read_source(file, options)
-    return set_of(source, options, "lists of file names" if source.held_out else f"only {file.name} read")
+    return set_of(source, options, f"lists in {file.name}" if source.held_out else f"only {file.name} read")
 
 
 def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet:
@@ -99,6 +100,8 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     document = _document(file)
     shared = {key: value for key, value in document.items() if key != "frames"}
     frames = entries(file, "frame", document["frames"], shared)
+    if document.get(TEST_FRAMES):
+        frames += entries(file, "test frame", document[TEST_FRAMES], shared)
     exported = any(EXPORTED in frame for frame in frames)
     folder = PhotoFolder(file.parent, file.parent)
     paths = [_plain(frame.get("file_path", text)) for frame in frames]
@@ -151,7 +154,7 @@ def _dataparser(path: Path) -> Dataparser | None:
 
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> list[bool] | None:
-    """True for each frame that nerfstudio's lists of file names keep from training; None without lists."""
+    """True for each frame that lists of file names or of frames keep from training; None without lists."""
     lists, frames = dict[str, set[str]](), set(paths)
     place = Place(file, "lists of file names")
     for key in filter(document.__contains__, FILE_LISTS):
@@ -162,7 +165,8 @@ def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> lis
             place.expect(_plain(path) in frames, key, "paths of frames", path)
         lists[key] = set(map(_plain, listed))
     if not lists:
-        return None
+        training = len(document["frames"])
+        return [i >= training for i in range(len(paths))] if len(paths) > training else None
     train = lists.get(FILE_LISTS[0], frames.difference(*lists.values()))
     return [path not in train for path in paths]
 
