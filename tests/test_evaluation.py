@@ -31,7 +31,7 @@ from aaplug.evaluation.results import (
     tables,
 )
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, ViewTruth, back_projected
-from aaplug.io.images import read_image
+from aaplug.io.images import read_image, write_png
 from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING
 from aaplug.methods import RECIPES
 from aaplug.methods.presets import find_recipe
@@ -362,6 +362,13 @@ def test_a_full_memory_caches_nothing_more(look, views, room):
     assert truth(views[0], 0.5).equal(first)
     assert not truth(views[1], 0.5).equal(first)
     assert truth(views[1], 0.5).equal(second)
+
+
+def test_a_photograph_whose_half_pixels_were_cut_is_large_enough(look, views, tmp_path):
+    write_png(tmp_path / "half.png", torch.full((24, 32, 3), 0.2))
+    view = ViewTruth(Truth(look, "photographs"), replace(views[0].resized(65, 49), photo=tmp_path / "half.png"))
+    torch.testing.assert_close(view.image(0.5), torch.full((24, 32, 3), 0.2))
+    assert view.image(0.55) is None
 
 
 def test_larger_truth_has_the_averages_of_the_training_size(look, views):
