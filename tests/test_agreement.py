@@ -17,12 +17,12 @@ from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.scene import Scene
 from aaplug.options.shared import Orbit, ViewOptions
-from aaplug.rendering.agreement import Agreement, agreement, settled
+from aaplug.rendering.agreement import Agreement, agreement, contradictions, settled
 from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FrameError
-from tests.conftest import make_camera, make_scene
+from tests.conftest import SAMPLE, make_camera, make_scene, write_model
 from tests.scene_files import half_turn_about_x
 
 
@@ -151,3 +151,20 @@ def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_c
     bare = tuple(replace(view, photo=None) for view in sample_cameras.train)
     chosen = settled(opened, replace(sample_cameras, train=bare, test=bare))
     assert torch.equal(chosen.gaussians().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").gaussians().means)
+
+
+def test_what_a_models_own_files_say_otherwise_than_the_cameras_is_told(few, sample_cameras, tmp_path: Path):
+    views = [*sample_cameras.train[:2], *sample_cameras.test[:1]]
+    given = replace(sample_cameras, train=tuple(views[:2]), test=tuple(views[2:]), background=None)
+    model = write_model(tmp_path / "model", views, "eval=False, resolution=2, white_background=True", few, 7)
+    half, whole = (f"{round(s * views[0].width)}×{round(s * views[0].height)} px" for s in (0.5, 1))
+    assert contradictions(read_scene(model), given) == [
+        f"trained at {half}, and these cameras say {whole}; --images or --train-scale sets it",
+        "trained on 1 of the 1 test view of these cameras",
+        "trained on white",
+    ]
+    (model / "cfg_args").write_text("Namespace(eval=False, resolution=1)")
+    assert contradictions(read_scene(model), replace(given, test=given.train)) == []
+    (model / "cfg_args").write_text("Namespace(")
+    assert contradictions(read_scene(model), given) == []
+    assert contradictions(read_scene(SAMPLE / "chair.ply"), given) == []

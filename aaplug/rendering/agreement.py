@@ -13,11 +13,13 @@ import torch
 from aaplug.core.cameras import CameraSet, spread
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
+from aaplug.io.cameras import inria, read_cameras
+from aaplug.io.cameras.sets import described_sizes
 from aaplug.io.photographs import photo_of
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
 from aaplug.rendering.renderer import Renderer, own_look
-from aaplug.system.errors import AaplugError
+from aaplug.system.errors import AaplugError, counted
 from aaplug.system.monitor import SILENT, Monitor
 
 SAMPLE = 50_000  # Gaussians whose places are looked at
@@ -27,6 +29,7 @@ SIDE = 100  # px: longer side of the images that are compared
 FLAT = (0.5 / 255) ** 2  # variance of an image up to which it is one colour, rounded to 8 bits
 LARGEST = 3_000_000  # Gaussians: a larger scene is not rendered for this
 HALF_A_SIDE = 0.5  # distance from the image's centre beyond which the scene's middle is outside of it
+MAX_SIZE_ERROR = 0.02  # relative difference of two training sizes that rounding explains
 MIN_SHARE_LEAD = 0.1  # of Gaussians seen, by which a reading fits better
 
 
@@ -100,6 +103,31 @@ def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scen
     how, _, _ = reading.notes[-1].partition(" (")
     monitor.say(f"{scene.title}: {how}, as fits the cameras: {fits[better]}")
     return reading
+
+
+def contradictions(scene: Scene, cameras: CameraSet) -> list[str]:
+    """What the settings in a scene's own model folder say of its training that cameras from elsewhere do not.
+
+    Cameras are told apart by name.  A model whose files cannot be read says nothing.
+    """
+    path, files = scene.camera_path, {file.absolute() for file in cameras.files}
+    if path is None or not inria.Model.sniff(path) or (path / inria.FILE).absolute() in files:
+        return []
+    try:
+        own = read_cameras(path)
+    except AaplugError:
+        return []
+    views, trained, found = {view.name: view for view in own.all}, {view.name for view in own.train}, list[str]()
+    pairs = [(view, views[view.name]) for view in cameras.train if view.name in views]
+    if any(abs(view.width / of_own.width - 1) > MAX_SIZE_ERROR for view, of_own in pairs):
+        here, there = (described_sizes(each) for each in zip(*pairs, strict=True))
+        found.append(f"trained at {there}, and these cameras say {here}; --images or --train-scale sets it")
+    held_out = {view.name for view in cameras.test} - {view.name for view in cameras.train}
+    if both := held_out & trained:
+        found.append(f"trained on {len(both)} of the {counted(len(held_out), 'test view')} of these cameras")
+    if own.background not in (None, background_colour("auto", cameras)):
+        found.append(f"trained on {'white' if own.background == WHITE else 'black'}")
+    return found
 
 
 @torch.no_grad()

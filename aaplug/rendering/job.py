@@ -30,7 +30,7 @@ from aaplug.options.base import Options
 from aaplug.options.shared import FrameOptions, Orbit, RecipeOptions, ViewOptions
 from aaplug.options.verbs import ALL, IN_TIME
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rendering.agreement import agreement, settled
+from aaplug.rendering.agreement import agreement, contradictions, settled
 from aaplug.rendering.assumed import cameras_around, decibels_at
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
@@ -69,6 +69,8 @@ class Job(Generic[O_co]):
             cameras = cameras_around(opened, cameras, single)
         elif not isinstance(cameras, CameraSet):
             cameras = read_cameras(cameras)
+        for what in contradictions(opened, cameras):
+            options.monitor.say(f"{opened.camera_path}: {what}")
         return Job(settled(opened, cameras, options.monitor), cameras, options)
 
     @property
