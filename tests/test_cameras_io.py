@@ -493,6 +493,16 @@ def test_blender_values(tmp_path):
     assert (camera.hw, camera.trained_focal, camera.fx) == ((5, 10), camera.focal, pytest.approx(5))
 
 
+@pytest.mark.parametrize(
+    ("suffix", "mode"), [("png", "RGBA"), ("png", "LA"), ("png", "P"), ("webp", "RGBA"), ("png", "RGB")]
+)
+def test_photos_with_any_kind_of_alpha_are_on_white(tmp_path, suffix, mode):
+    clear = {"transparency": 0} if mode == "P" else {}
+    Image.new(mode, (40, 20)).save(tmp_path / f"a.{suffix}", **clear)
+    path = write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}]))
+    assert read_cameras(path).background == (None if mode == "RGB" else WHITE)
+
+
 def test_blender_split_is_not_overruled(tmp_path):
     with pytest.raises(UsageError, match="gives the split"):
         read_cameras(blender(tmp_path), test_every=8)

@@ -31,7 +31,6 @@ from aaplug.core.colours import Colour
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import AnyPath, write_file
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of, reason
 from aaplug.system.executors import torch_threads
@@ -48,8 +47,6 @@ PREMULTIPLIED, STRAIGHT = 1, 2  # its values
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHUNK = struct.Struct(">I4s")  # length of the data and kind, before them
 PNG_CHECKSUM = 4  # bytes, after them
-PNG_COLOUR_TYPE = 25  # byte of the header
-PNG_ALPHA = (b"\4", b"\6")  # colour types with alpha: gray and RGB
 PNG_PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")  # chunks that make a still picture
 LOSS_MESSAGES = ("Corrupt JPEG data: premature end", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
 DAMAGE_MESSAGE = "Corrupt JPEG data"  # libjpeg's for what may be harmless too: bytes between the markers
@@ -63,10 +60,12 @@ def image_size(path: AnyPath) -> tuple[int, int]:
     return _look(Path(path))[0]
 
 
-def is_png_with_alpha(path: Path) -> bool:
-    """True for a PNG whose header tells of an alpha channel."""
-    start = read_start(path, PNG_COLOUR_TYPE + 1)
-    return start.startswith(PNG_SIGNATURE) and start[PNG_COLOUR_TYPE:] in PNG_ALPHA
+def is_transparent(path: Path) -> bool:
+    """True for an image whose header tells of transparency; False for what cannot be read."""
+    try:
+        return _look(path)[1]
+    except FormatError:
+        return False
 
 
 @contract

@@ -27,7 +27,7 @@ from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
-from aaplug.io.images import image_size, is_png_with_alpha
+from aaplug.io.images import image_size, is_transparent
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
 from aaplug.io.values import Entry, Place, entries, focal, mentions, number, object_of, pixels, read_json, text
 from aaplug.system.errors import FormatError
@@ -88,7 +88,7 @@ def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet
     else:
         cameras = sorted(cameras, key=lambda camera: camera.name) if options.test_every else cameras
         split = sets.every_nth(cameras, options, 0, reason)
-    alpha = any(is_png_with_alpha(camera.photo) for camera in source.cameras if camera.photo)
+    alpha = any(is_transparent(camera.photo) for camera in source.cameras if camera.photo)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
     background = WHITE if alpha else None
     return sets.camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
