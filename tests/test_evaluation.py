@@ -364,11 +364,14 @@ def test_a_full_memory_caches_nothing_more(look, views, room):
     assert truth(views[1], 0.5).equal(second)
 
 
-def test_a_photograph_whose_half_pixels_were_cut_is_large_enough(look, views, tmp_path):
-    write_png(tmp_path / "half.png", torch.full((24, 32, 3), 0.2))
-    view = ViewTruth(Truth(look, "photographs"), replace(views[0].resized(65, 49), photo=tmp_path / "half.png"))
-    torch.testing.assert_close(view.image(0.5), torch.full((24, 32, 3), 0.2))
-    assert view.image(0.55) is None
+@pytest.mark.parametrize(("size", "width", "scale"), [((65, 49), 32, 0.5), ((8, 6), 30, 4.0)])
+def test_a_photograph_is_large_enough_where_its_size_or_its_views_was_rounded(
+    look, views, tmp_path, size, width, scale
+):
+    write_png(tmp_path / "photo.png", torch.full((24, width, 3), 0.2))
+    view = ViewTruth(Truth(look, "photographs"), replace(views[0].resized(*size), photo=tmp_path / "photo.png"))
+    torch.testing.assert_close(view.image(scale), torch.full((24, 32, 3), 0.2))
+    assert view.image(1.2 * scale) is None
 
 
 def test_larger_truth_has_the_averages_of_the_training_size(look, views):

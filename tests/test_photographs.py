@@ -10,8 +10,8 @@ from PIL import Image
 
 from aaplug.core.imaging import box_average, quantised, resampled, stretched
 from aaplug.io.images import read_image
-from aaplug.io.photographs import DOWNSCALES, photo_of
-from aaplug.system.errors import UsageError
+from aaplug.io.photographs import DOWNSCALES, Photograph, photo_of
+from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera
 
 WHITE = (1.0, 1.0, 1.0)
@@ -78,6 +78,17 @@ def test_a_view_trained_at_a_rounded_size_is_compared_with_the_whole_photograph(
     whole = quantised(read_image(rgba, WHITE))
     assert torch.allclose(photo_of(view, WHITE)(view), stretched(whole, (6, 10)), atol=1e-6)
     assert torch.allclose(photo_of(view, WHITE)(view.scaled(1 / 2)), stretched(whole, (3, 5)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("view", "photograph"), [((618, 411), (4946, 3286)), ((50, 38), (202, 150)), ((1237, 822), (618, 411))]
+)
+def test_the_shape_of_a_photograph_may_differ_by_the_rounding_of_either_size(view, photograph):
+    """Those of Mip-NeRF 360's bicycle at 1/8 and 1/4 among them; one turned on its side is of another shape."""
+    factors = Photograph(photograph[::-1], lambda hw, factors: torch.empty(0)).factors
+    assert factors(make_camera(size=view), 1.0) == (view[1] / photograph[1], view[0] / photograph[0])
+    with pytest.raises(FormatError, match=f"is {photograph[0]}x{photograph[1]} px, of another shape"):
+        factors(make_camera(size=view[::-1]), 1.0)
 
 
 @pytest.mark.parametrize("factor", [0.35, 2 / 3 + 1e-3, 1.7])

@@ -158,7 +158,7 @@ class ViewTruth:
         photographs = truth.source == "photographs"
         if photographs:
             factors = self._photograph.factors(self.view, scale)
-            if factors[1] <= 1 + 1 / self._photograph.hw[1]:  # sides were rounded
+            if factors[1] <= 1 + 1 / min(self._photograph.hw[1], self.view.width):  # either was rounded
                 return self._photograph.at(camera.hw, factors)
         elif truth.renderer.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)

@@ -41,13 +41,13 @@ class Photograph:
     def factors(self, view: Camera, scale: float) -> Factors:
         """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.
 
-        A photograph may be larger or smaller than the size at which its view was trained, of which a side was rounded.
+        A photograph may be larger or smaller than the size at which its view was trained, and both were rounded.
 
         Raises:
             FormatError: it is not of the camera's shape.
         """
-        (height, width), rounding = self.hw, 1 + max(view.hw) / min(view.hw)  # px
-        if abs(height - width * view.height / view.width) > rounding:
+        (height, width), rounding = self.hw, 1 + max(view.hw) / min(view.hw)  # px of the smaller of the two
+        if abs(height - width * view.height / view.width) > rounding * max(1, width / view.width):
             cameras = f"the cameras say {view.width}x{view.height}"
             raise FormatError(view.photo or view.name, f"is {width}x{height} px, of another shape than {cameras}")
         return scale * view.height / height, scale * view.width / width

@@ -18,7 +18,7 @@ from aaplug.io.cameras.sets import described_sizes
 from aaplug.io.photographs import photo_of
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
-from aaplug.rendering.renderer import Renderer, own_look
+from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import AaplugError, counted
 from aaplug.system.monitor import SILENT, Monitor
 
