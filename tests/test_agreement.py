@@ -86,10 +86,10 @@ def test_cameras_of_another_capture_are_refused_unless_min_seen_is_0(few, sample
         lambda: aaplug.convert(scene, cameras),
         lambda: aaplug.merge([scene], cameras, into="mip"),
     ):
-        with pytest.raises(FrameError, match=r"seem to be of different captures.*if they are right, pass `min_seen` 0"):
+        with pytest.raises(FrameError, match=r"or frames: .*; gsplat and .*; if they are right, pass `min_seen` 0"):
             verb()
     replace(job, options=ViewOptions(min_seen=0.0)).look(1)
-    assert "seem to be of different captures" in caplog.text
+    assert "seem to be of different captures or frames" in caplog.text
 
 
 @pytest.mark.parametrize("background", ["auto", "black", (0.0, 0.5, 0.0)])

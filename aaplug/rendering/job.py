@@ -123,9 +123,10 @@ class Job(Generic[O_co]):
         fit = agreement(look, self.cameras)
         self.monitor.say(f"fit: {fit}")
         if fit.doubt:
-            problem = f"scene and cameras seem to be of different captures: {fit.doubt}"
+            problem = f"scene and cameras seem to be of different captures or frames: {fit.doubt}"
             if self.options.min_seen > 0:
-                raise FrameError(look.scene.name, f"{problem}; if they are right, pass `min_seen` 0")
+                hint = "gsplat and nerfstudio train in frames of their own (`aaplug guide formats`)"
+                raise FrameError(look.scene.name, f"{problem}; {hint}; if they are right, pass `min_seen` 0")
             log.warning("%s: %s", look.scene.name, problem)
 
     def named(self: "Job[RecipeOptions]", *recipes: str | Recipe) -> list[Recipe]:
