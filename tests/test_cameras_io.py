@@ -578,6 +578,9 @@ def test_what_is_not_read_beside_the_cameras_is_told(tmp_path):
     assert "masks are not read" in told
     assert "photos: images holds none of these cameras' (a.b.png); `images` names another folder, such as" in told
     assert "other models beside 0, not read: 1" in told
+    (tmp_path / "test_list.txt").touch()
+    (tmp_path / "sparse" / "0" / "test.txt").touch()
+    assert "lists of views, not read: test_list.txt, test.txt" in read_cameras(tmp_path).notes
     assert "other cameras in the folder, not read: transforms.json (nerfstudio, instant-ngp)" in told
 
 
@@ -778,7 +781,7 @@ def multiscale(folder):
     row = {"file_path": ["train/r_0.png", "train/r_0_d1.png"], "cam2world": [OPENGL] * 2, "label": [0, 1]}
     row |= {"width": [40, 20], "height": [20, 10], "focal": [30.0, 15.0]}
     test = {key: values[:1] for key, values in row.items()}
-    return write_json(folder / "metadata.json", {"train": row, "test": test})
+    return write_json(folder / "metadata.json", {"train": row, "val": test, "test": test})
 
 
 def test_multiscale_blender_has_a_view_a_scale(tmp_path):
@@ -786,6 +789,7 @@ def test_multiscale_blender_has_a_view_a_scale(tmp_path):
     assert names(cameras.train) == ["r_0", "r_0_d1"]
     assert [(c.fx, c.hw, c.trained_focal) for c in cameras.train] == [(30, (20, 40), 30), (15, (10, 20), 15)]
     assert (len(cameras.test), cameras.background) == (1, WHITE)
+    assert "val in metadata.json is not read" in cameras.notes
     with pytest.raises(UsageError, match="gives the split"):
         read_cameras(tmp_path, test_every=8)
 

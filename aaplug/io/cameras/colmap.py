@@ -23,6 +23,7 @@ from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
 from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
+SPLIT_LISTS = ("train_list.txt", "test_list.txt", "test.txt")  # nerfbaselines' and 3DGS's
 MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
 
 name = "colmap"
@@ -47,7 +48,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     photos = photo_folder(root, options, "images", Place(folder, "images"))
     source = [_camera(image, intrinsics) for image in images]
     source = with_photos(source, [image.place for image in images], photos)
-    more = [*photos.notes(source), *_other_models(folder)]
+    folders = dict.fromkeys((root, folder.absolute()))
+    lists = [name for each in folders for name in SPLIT_LISTS if os.path.isfile(each / name)]
+    unread = [f"lists of views, not read: {', '.join(lists)}"] if lists else []
+    more = [*photos.notes(source), *_other_models(folder), *unread]
     names = distinct(images_file, [image.name for image in images], (without_suffix, str))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     trained, why = sets.at_photo_size(source, options)

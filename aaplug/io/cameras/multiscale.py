@@ -43,7 +43,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     what = f"multi-scale Blender: {counted(len(train) + len(test), 'camera')}, {described_sizes(train)}"
     size = "training size: each photo's own, as all scales were trained on"
     notes = what, *split.notes, size, "background: white, Blender's custom"
-    return replace(split, background=WHITE, notes=notes)
+    unread = (f"val in {FILE} is not read",) if "val" in document else ()
+    return replace(split, background=WHITE, notes=notes + unread)
 
 
 def _cameras(document: Entry, split: str) -> list[Camera]:
