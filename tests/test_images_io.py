@@ -114,11 +114,16 @@ def test_an_orientation_tag_moves_no_pixel(tmp_path: Path):
     assert (got[:, :12] > 0.9).all()
 
 
-@pytest.mark.parametrize(("mode", "orientation"), [("CMYK", 1), ("LA", 1), ("RGBA", 1), ("F", 1), ("RGB", 3), ("L", 6)])
-def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str, orientation: int):
-    Image.new(mode, (4, 4)).save(tmp_path / "a.tiff", tiffinfo={0x0112: orientation})
+@pytest.mark.parametrize(
+    ("suffix", "mode", "orientation"),
+    [("tiff", mode, 1) for mode in ("CMYK", "LA", "RGBA", "F", "LAB")]
+    + [("tiff", "RGB", 3), ("tiff", "L", 6), ("jpg", "CMYK", 1)],
+)
+def test_samples_that_would_be_misread_are_refused(tmp_path: Path, suffix: str, mode: str, orientation: int):
+    tags = {"tiffinfo": {0x0112: orientation}} if suffix == "tiff" else {}
+    Image.new(mode, (4, 4)).save(tmp_path / f"a.{suffix}", **tags)
     with pytest.raises(FormatError, match="save it"):
-        read_image(tmp_path / "a.tiff", WHITE)
+        read_image(tmp_path / f"a.{suffix}", WHITE)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tiff", ".bmp"])

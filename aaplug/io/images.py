@@ -41,6 +41,7 @@ ROWS_PER_BAND = 64  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
 MAX_PIXEL_SIZE = 8  # bytes: four channels of 16 bits
+MISREAD = ("CMYK", "LAB")  # modes of Pillow that OpenCV makes other RGB of
 TIFF_ORIENTATION = 274  # tag Orientation; 1 turns nothing
 TIFF_ALPHA = 338  # tag ExtraSamples
 PREMULTIPLIED, STRAIGHT = 1, 2  # its values
@@ -150,7 +151,7 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
     pillow_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it is lower than ours and only warns
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
-            size, transparent = header.size, header.has_transparency_data
+            size, transparent, mode = header.size, header.has_transparency_data, header.mode
             tags = getattr(header, "tag_v2", {})
             alpha, orientation = tags.get(TIFF_ALPHA, (0,))[-1], tags.get(TIFF_ORIENTATION, 1)
             stored = path.stat().st_size
@@ -162,6 +163,8 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
         raise FormatError(path, f"is not an image that can be read ({listing(FORMATS)})") from error
     finally:
         Image.MAX_IMAGE_PIXELS = pillow_limit
+    if mode in MISREAD:
+        raise FormatError(path, f"has {mode} colours, which OpenCV converts in its own way; save it as RGB PNG")
     if orientation != 1:
         raise FormatError(path, f"has the tag Orientation {orientation}, by which OpenCV turns a TIFF; save it without")
     pixels, most = size[0] * size[1], whole_limit("IMAGE")  # an image above it counts as a decompression bomb
