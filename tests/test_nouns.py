@@ -2,8 +2,11 @@
 
 import copy
 import math
+import os
 import pickle
 from dataclasses import replace
+from multiprocessing.context import set_spawning_popen
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import pytest
@@ -100,6 +103,33 @@ def test_a_copy_of_a_scene_holds_its_rows_and_equals_itself_alone(held, copied, 
     assert (other.levels is None) == (held is not PYRAMID)
     assert scene == scene != other
     assert len({scene, other}) == 2
+
+
+class Starting(list[int]):
+    """A process that is being started: the files that torch hands over to it, by number."""
+
+    duplicate_for_child, DupFd = list[int].append, str
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system hands no files over")
+@pytest.mark.parametrize("read", [True, False], ids=["read", "unread"])
+@pytest.mark.parametrize("first", [b"", b"\xff" * 4], ids=["whole", "a row left out"])
+def test_a_scene_is_sent_to_a_process_that_starts(read, first, tmp_path):
+    path, process = tmp_path / "scene.ply", Starting()
+    write_scene(path, make_scene(6))
+    header, end, rows = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes(header + end + first + rows[len(first) :])
+    scene = read_scene(path, drop_bad=True)
+    if read:
+        assert len(scene.gaussians()) == 6 - bool(first)
+    set_spawning_popen(process)
+    try:
+        ForkingPickler.dumps(scene)
+    finally:
+        set_spawning_popen(None)
+    assert len({*process}) == len(process) > 0
+    for number in process:
+        os.fstat(number)  # open until the process has started
 
 
 def test_two_openings_of_a_file_are_two_scenes(tmp_path):

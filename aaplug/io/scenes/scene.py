@@ -116,7 +116,11 @@ class Scene:
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies hold the rows: what reads a file does not leave its process."""
-        rows = self.raw(0, self.count)
+        rows = self.memory.get("gaussians")
+        if rows is None or len(rows) != self.count:  # not read yet, or some were left out
+            if "rows" not in self.memory:  # kept: torch shares a tensor with a new process only while it is held
+                self.memory["rows"] = self.raw(0, self.count)
+            rows = self.memory["rows"]
         return {**vars(self), "load": partial(held_rows, rows), "other": None}
 
     @property
