@@ -121,12 +121,16 @@ def test_quality_is_that_of_auto(cameras):
     assert Renderer.of(scene, cameras, "matched", quality="best").recipe.target_rate == 0
 
 
-@pytest.mark.parametrize("recipe", ["auto", "2dgs", "analytic"])
+@pytest.mark.parametrize("recipe", ["auto", "2dgs", "analytic", "mip-splatting"])
 def test_autocast_changes_nothing(recipe, cameras):
-    renderer = Renderer.of(make_scene(30), cameras, recipe)
-    expected = renderer(cameras[0].scaled(1 / 2)).rgb
+    def drawn():
+        renderer, view = Renderer.of(make_scene(30), cameras, recipe), cameras[0].scaled(1 / 2)
+        found = renderer.passes(view, ["normal", "position"])
+        return [renderer(view).rgb, *found.values(), *renderer.scene.columns.values()]
+
+    expected = drawn()
     with torch.autocast("cpu"):
-        assert renderer(cameras[0].scaled(1 / 2)).rgb.equal(expected)
+        assert all(map(torch.equal, drawn(), expected))
 
 
 def test_paths_are_read(sample_cameras):

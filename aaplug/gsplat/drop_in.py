@@ -10,7 +10,6 @@ from torch import Tensor
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC, MAX_KERNEL
 from aaplug.core.interfaces import Rasterizer, RunsKernels
-from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
@@ -31,7 +30,6 @@ MaxAlpha = Annotated[float, Range(above=RULES_GSPLAT.min_alpha, most=1 - 1e-6)]
 
 
 @contract
-@in_full_precision()
 def rasterization(
     means: Float[Tensor, "*b n 3"],
     quats: Float[Tensor, "*b n 4"] | None,

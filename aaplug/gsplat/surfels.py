@@ -11,7 +11,6 @@ from torch.nn import functional
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer
-from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
@@ -30,7 +29,6 @@ DEPTH_MODES = ("expected", "median")
 
 
 @contract
-@in_full_precision()
 def rasterization_2dgs(
     means: Float[Tensor, "*b n 3"],
     quats: Float[Tensor, "*b n 4"],

@@ -26,7 +26,7 @@ from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns, SortsTiles
-from aaplug.core.kernels import Kernels, in_full_precision
+from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.core.projection import project, with_depth_slopes, with_ray_slopes
@@ -206,7 +206,6 @@ class Renderer:
         return self._open[frame]
 
     @contract
-    @in_full_precision()
     @on_free_cores()
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`; with an exposure, the mean of its frames.
@@ -230,7 +229,6 @@ class Renderer:
             return Render(rgb / count, alpha / count)
 
     @contract
-    @in_full_precision()
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""

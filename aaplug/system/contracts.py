@@ -81,7 +81,7 @@ ANYTHING = Term(lambda value, sizes: True, "anything")
 
 
 def contract(function: F) -> F:
-    """The same function, which raises UsageError for an argument that does not fit its hint, and works in memory."""
+    """The same function in memory and full precision; raises UsageError for an argument that does not fit its hint."""
     names = tuple(inspect.signature(function).parameters)
     terms = dict[str, Term]()  # filled when it is called first: a hint may name a class that stands below
     in_order = list[Term]()
@@ -98,7 +98,7 @@ def contract(function: F) -> F:
         for name, value in keywords.items():
             if name in terms and not terms[name].holds(value, sizes):
                 refuse(name, value, terms[name], sizes)
-        with in_memory():
+        with in_memory(), in_full_precision():
             return function(*args, **keywords)
 
     return checked  # pyright: ignore[reportReturnType]
@@ -109,6 +109,13 @@ def in_memory() -> AbstractContextManager[Any]:
     torch = sys.modules.get("torch")
     made = getattr(torch, "empty", None)  # another thread may be importing it
     return nullcontext() if torch is None or made is None or made(0).is_cpu else torch.device("cpu")
+
+
+def in_full_precision() -> AbstractContextManager[Any]:
+    """A block without the program's `torch.autocast`: bfloat16 has too few digits to place a splat."""
+    torch = sys.modules.get("torch")
+    asked = getattr(torch, "is_autocast_enabled", None)
+    return nullcontext() if torch is None or asked is None or not asked("cpu") else torch.autocast("cpu", enabled=False)
 
 
 def check_fields(noun: Any) -> None:
