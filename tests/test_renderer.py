@@ -306,6 +306,10 @@ def test_the_rate_of_a_free_camera_is_computed_once_per_pose(cameras, monkeypatc
     assert len(calls) == 3
     renderer(cameras[0])
     assert len(calls) == 3, "a pose of the data set needs no bounds"
+    assert renderer.relative_rate(replace(view, lens=Lens("ortho"))) > 2 * rate
+    monkeypatch.setattr(rendering, "KEPT_RATES", 2)
+    assert [renderer.relative_rate(view.scaled(factor)) for factor in (1.0, 0.7, 0.8, 0.9, 1.0)][-1] == rate
+    assert len(renderer._rates) <= 2
 
 
 def test_without_a_look_at_the_scene_a_free_camera_is_compared_by_focal_length():

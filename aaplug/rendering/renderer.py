@@ -55,6 +55,7 @@ from aaplug.system.errors import UsageError, not_one_of, within_memory
 from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
+KEPT_RATES = 1 << 12  # free cameras whose rates a renderer remembers
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -390,10 +391,14 @@ class Renderer:
         screen = self.recipe.screen
         if camera.trained_focal is not None or (isinstance(screen, Matched) and screen.reference == "global"):
             return self.training.relative_rate(camera)
-        key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
-        if key not in self._rates:
-            self._rates[key] = self._median_rate(camera)
-        return self._rates[key]
+        key = (camera.lens, *camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
+        rate = self._rates.get(key)
+        if rate is None:
+            rate = self._median_rate(camera)
+            if len(self._rates) >= KEPT_RATES:
+                self._rates.clear()
+            self._rates[key] = rate
+        return rate
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:
