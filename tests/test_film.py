@@ -93,6 +93,25 @@ def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion
     assert torch.allclose(spread(splats, camera).double(), truth, rtol=0.05, atol=0.05)
 
 
+@pytest.mark.parametrize("samples", [1, 7])
+@pytest.mark.parametrize("aperture", [None, APERTURE], ids=["pinhole", "aperture"])
+@pytest.mark.parametrize("motion", [None, (VIEW, VIEW), (VIEW, MOVED)], ids=["no shutter", "still", "moved"])
+def test_gradients_of_a_cell_are_finite_differences(aperture, motion, samples):
+    scene, camera = make_scene(30, dtype=torch.float64), exposed(aperture, motion, samples)
+    weights, step = (torch.rand(2, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5) * 1e-6
+
+    def total(means):
+        splats = project(replace(scene, means=means), camera)
+        return (cells(splats, camera) * weights[splats.sources]).sum() / 1e-6
+
+    means = scene.means.clone().requires_grad_()
+    total(means).backward()
+    slope = float((means.grad * step).sum())
+    assert float(total(scene.means + step / 2) - total(scene.means - step / 2)) == pytest.approx(
+        slope, rel=1e-4, abs=1e-12
+    )
+
+
 def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
     """The camera turns by 149 degrees; points at its height move along a great circle, some to behind their planes."""
     angle, scene = 2.6, make_scene(30)

@@ -26,6 +26,7 @@ from aaplug.core.splats import Splats2D
 # measured.  Opaque splats hide each other, and a wider filter adds the energies of those that are hidden too.
 MAX_CELL_SHARE, SHARE_PER_WIDTH = 0.5, 2.0
 DIMENSIONS = 5  # x and y in the pixel and in the lens, and time
+SHORTEST = 1e-12  # px²: least variance of a path, at which roots have gradients
 MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
 MAX_GENERATORS = 256  # lattices tried
 
@@ -52,14 +53,14 @@ def cells(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
     """
     assert camera.exposure is not None
     xx, xy, yy = spread(splats, camera).unbind(dim=1)
-    middle, half, count = (xx + yy) / 2, (xx - yy) / 2, camera.exposure.samples
-    radius = torch.hypot(half, xy)
-    longer, shorter = middle + radius, (middle - radius).clamp(min=0.0)
+    middle, half, count = ((xx + yy) / 2).clamp(min=SHORTEST), (xx - yy) / 2, camera.exposure.samples
+    tiny = torch.finfo(xx.dtype).tiny
+    radius = torch.hypot(half, xy + tiny)
+    longer, shorter = middle + radius, (middle - radius).clamp(min=SHORTEST)
     even = (longer * shorter).sqrt() / count
     along, across = torch.maximum(even, longer / count**2), torch.minimum(even, shorter)
-    tiny = torch.finfo(xx.dtype).tiny
-    mean, turn = (along + across) / 2, (along - across) / 2 / radius.clamp(min=tiny)
-    ratio = (splats.covs[:, 0] + splats.covs[:, 2]) / (2 * middle).clamp(min=tiny)
+    mean, turn = (along + across) / 2, (along - across) / 2 / radius
+    ratio = (splats.covs[:, 0] + splats.covs[:, 2]) / (2 * middle)
     share = (SHARE_PER_WIDTH * ratio.clamp(min=tiny).sqrt()).clamp(max=MAX_CELL_SHARE)
     return share[:, None] * torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
 
