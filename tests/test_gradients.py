@@ -13,10 +13,12 @@ import aaplug
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
+from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, sized
 
 F64 = torch.float64
@@ -87,10 +89,32 @@ def test_gradients_are_finite_differences(recipe):
 @pytest.mark.parametrize(
     "mode", [torch.enable_grad, torch.no_grad, torch.inference_mode], ids=lambda mode: mode.__name__
 )
-def test_verbs_work_in_every_mode_of_autograd_and_on_a_scene_that_it_follows(mode, recwarn):
+@pytest.mark.parametrize("held", [Gaussians, Scene.in_memory], ids=["Gaussians", "Scene"])
+def test_verbs_work_in_every_mode_of_autograd_and_on_what_it_follows(mode, held, recwarn):
     with mode():
         scene = SCENE.to(torch.float32)
         scene = replace(scene, **{name: 1 * column.clone().requires_grad_() for name, column in scene.columns.items()})
-        level = aaplug.lod(scene, CameraSet((CAMERA,), (CAMERA,)), levels=1, steps=1, rasterizer="eager")[-1]
+        view = replace(CAMERA, cam_from_world=CAMERA.cam_from_world.clone().requires_grad_())
+        scene = scene if held is Gaussians else Scene.in_memory(scene)
+        level = aaplug.lod(scene, CameraSet((view,), (view,)), levels=1, steps=1, rasterizer="eager")[-1]
     assert not level.scene.means.requires_grad
     assert not [each for each in recwarn if "requires_grad" in str(each.message)]
+
+
+def test_what_autograd_follows_is_looked_at_and_measured(recwarn):
+    torch.set_warn_always(True)
+    try:
+        scene = replace(SCENE, means=SCENE.means.clone().requires_grad_())
+        assert len(aaplug.cameras_around(scene, aaplug.Orbit(orbit=2)).train) > 0
+        eye, up = torch.tensor([0.0, 0.0, -4.0], requires_grad=True), torch.tensor([0.0, -1.0, 0.0])
+        pose = aaplug.look_at(eye, torch.zeros(3), up)
+        pose[2, 3].backward()
+        image = torch.rand(16, 16, 3, requires_grad=True)
+        assert all(aaplug.METRICS[name].compare(image, image) is not None for name in ("SSIM", "FLIP"))
+    finally:
+        torch.set_warn_always(False)
+    assert eye.grad is not None
+    assert eye.grad.tolist() == [0.0, 0.0, -1.0]
+    assert not [str(each.message) for each in recwarn]
+    with pytest.raises(UsageError, match="motion: expected poses that require no gradients"):
+        aaplug.Exposure(None, (CAMERA, replace(CAMERA, cam_from_world=pose)))

@@ -226,7 +226,7 @@ class Exposure:
     """The exposure of a frame: the opening of its lens, and the time that its shutter is open.
 
     aperture: None for a pinhole.
-    motion: the cameras where the shutter opens and where it closes; None for an instant.
+    motion: the cameras where the shutter opens and where it closes, constants to gradients; None for an instant.
     samples: number of frames that are averaged.
     """
 
@@ -236,6 +236,8 @@ class Exposure:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if any(camera.cam_from_world.requires_grad for camera in self.motion or ()):
+            raise UsageError("motion", "expected poses that require no gradients, which no motion has; detach them")
 
 
 @dataclass(frozen=True)
@@ -324,11 +326,11 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
     """
     eye, target, up = (x.double() for x in (eye, target, up))
     sight = target - eye
-    if not 0 < float(sight.norm()) < math.inf:
+    if not 0 < float(sight.detach().norm()) < math.inf:
         raise UsageError("target", f"expected a place other than `eye`, got {target.tolist()}")
     forward = torch.nn.functional.normalize(sight, dim=0)
     right = torch.linalg.cross(forward, torch.nn.functional.normalize(up, dim=0))
-    if not float(right.norm()) > MIN_SINE:
+    if not float(right.detach().norm()) > MIN_SINE:
         raise UsageError("up", f"expected a direction other than that of sight, got {up.tolist()}")
     right = torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])

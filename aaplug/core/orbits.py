@@ -59,6 +59,7 @@ class Frame:
         return math.sqrt(distance**2 - self.radius**2) / (2 * self.radius)
 
 
+@torch.no_grad()
 def frame_of(scene: Gaussians, up: Sequence[float] | None = None) -> Frame:
     """The frame of a scene; with `up` given, it turns, moves and grows with the scene.
 

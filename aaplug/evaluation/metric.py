@@ -136,7 +136,7 @@ class Metric:
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""
-        return self._number(asked("metric", self, "measure", image, truth)) if self.measure else None
+        return self._number(asked("metric", self, "measure", image.detach(), truth.detach())) if self.measure else None
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""

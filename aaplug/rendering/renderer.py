@@ -211,7 +211,7 @@ class Renderer:
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`; with an exposure, the mean of its frames.
 
-        Differentiable in every parameter of the scene and in `camera.cam_from_world`.
+        Differentiable once, in every parameter of the scene and in `camera.cam_from_world`; a motion has its own poses.
 
         Raises:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.

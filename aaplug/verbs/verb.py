@@ -14,9 +14,12 @@ from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
 
 import torch
 
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import AnyPath, check_name
 from aaplug.io.scenes import SceneLike
+from aaplug.io.scenes.scene import Scene
 from aaplug.options.base import Options, documented
 from aaplug.rendering.job import CamerasLike
 from aaplug.system.contracts import contract
@@ -86,9 +89,18 @@ def compares(
 
 
 def _constant(value: Any) -> Any:
-    """The argument of a verb, without what autograd knows of Gaussians."""
+    """The argument of a verb, without what autograd knows of Gaussians and poses."""
     if isinstance(value, Gaussians) and any(column.requires_grad for column in value.columns.values()):
         return replace(value, **{name: column.detach() for name, column in value.columns.items()})
+    if isinstance(value, Pyramid):
+        return value if (scene := _constant(value.scene)) is value.scene else replace(value, scene=scene)
+    if isinstance(value, Scene) and value.path is None:
+        held = value.levels or value.gaussians()
+        return value if (constant := _constant(held)) is held else Scene.in_memory(constant)
+    if isinstance(value, Camera) and value.cam_from_world.requires_grad:
+        return replace(value, cam_from_world=value.cam_from_world.detach())
+    if isinstance(value, CameraSet):
+        return replace(value, train=tuple(map(_constant, value.train)), test=tuple(map(_constant, value.test)))
     if isinstance(value, Mapping):
         return {name: _constant(each) for name, each in value.items()}
     return [*map(_constant, value)] if isinstance(value, list | tuple) else value
@@ -106,7 +118,7 @@ def _verb(options: Any, body: Callable[..., Any]) -> Any:
         own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
         bound = inputs.bind(*args, **own)
         bound.apply_defaults()
-        for name in bound.arguments.keys() & {"scene", "scenes"}:
+        for name in bound.arguments.keys() & {"scene", "scenes", "cameras"}:
             bound.arguments[name] = _constant(bound.arguments[name])
         if isinstance(output := bound.arguments.get("output"), str | PathLike):
             check_name(output)
