@@ -101,6 +101,17 @@ def test_verbs_work_in_every_mode_of_autograd_and_on_what_it_follows(mode, held,
     assert not [each for each in recwarn if "requires_grad" in str(each.message)]
 
 
+def test_a_scene_that_was_read_in_inference_mode_has_gradients_later(tmp_path):
+    aaplug.write_scene(tmp_path / "scene.ply", SCENE)
+    scene = aaplug.read_scene(tmp_path / "scene.ply")
+    with torch.inference_mode():
+        scene.gaussians()
+    pose = CAMERA.cam_from_world.clone().requires_grad_()
+    renderer = Renderer.of(scene, [CAMERA], rasterizer="eager", min_seen=0.0)
+    renderer(replace(CAMERA, cam_from_world=pose)).rgb.sum().backward()
+    assert pose.grad is not None
+
+
 def test_what_autograd_follows_is_looked_at_and_measured(recwarn):
     torch.set_warn_always(True)
     try:

@@ -178,12 +178,14 @@ class Scene:
         return None if path is None else read_cameras(path)
 
     @property
+    @torch.inference_mode(False)  # autograd may follow later what is kept
     def levels(self) -> Pyramid | None:
         """All levels of detail, read once; None if there is but one.  Raises FormatError if a level is broken."""
         if "levels" not in self.memory:
             self.memory["levels"] = self.read_levels and self.read_levels()
         return self.memory["levels"]
 
+    @torch.inference_mode(False)
     def gaussians(self) -> Gaussians:
         """All Gaussians, read once; of levels of detail the finest.
 
@@ -349,6 +351,7 @@ def harmonics_in_file(
     return harmonics if end - first == len(rows) else harmonics[rows - first]
 
 
+@torch.inference_mode(False)
 def without_harmonics(scene: Scene) -> tuple[Gaussians, Callable[[int, int], Tensor] | None]:
     """The scene's Gaussians, and what reads their harmonics where these are large and stay in the file; else None.
 
