@@ -3,6 +3,8 @@
 import os
 import re
 import struct
+import tempfile
+import threading
 import time
 import zlib
 from functools import partial
@@ -16,7 +18,7 @@ from PIL import Image
 
 import aaplug
 from aaplug.core.imaging import levels, quantised
-from aaplug.io.images import checked_image, image_size, read_image, read_rgba, write_png
+from aaplug.io.images import captured_stderr, checked_image, image_size, read_image, read_rgba, write_png
 from aaplug.io.photographs import read_photo
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import memory_taken, needs_peak_memory
@@ -138,6 +140,33 @@ def test_a_damaged_image_is_one_silent_error(tmp_path: Path, suffix: str, capfd:
         with pytest.raises(FormatError, match=rf"a\{suffix}: is (damaged|not an image)"):
             read_image(whole, None)
     assert capfd.readouterr() == ("", "")
+
+
+def test_threads_that_capture_stderr_leave_it_as_it_was():
+    before, (both, first_left) = os.fstat(2), (threading.Event() for _ in range(2))
+
+    def first():
+        with captured_stderr():
+            other.start()
+            both.wait(0.1)  # the other waits for this one to leave
+        first_left.set()
+
+    def second():
+        with captured_stderr():
+            both.set()
+            first_left.wait()
+
+    other = threading.Thread(target=second)
+    first()
+    other.join()
+    assert os.path.samestat(os.fstat(2), before)
+
+
+@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no files in memory")
+def test_images_are_read_without_a_folder_of_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_png(tmp_path / "a.png", random_image())
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    assert read_image(tmp_path / "a.png", None).shape == (5, 7, 3)
 
 
 def test_a_jpeg_with_bytes_between_its_markers_is_read_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):

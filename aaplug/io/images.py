@@ -14,6 +14,7 @@ import os
 import re
 import struct
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -227,10 +228,22 @@ def _still(path: Path, data: bytes) -> bytes:
     return b"".join(parts)
 
 
+_capturing = threading.Lock()
+if hasattr(os, "register_at_fork"):  # no process begins as a copy of one whose stderr is captured
+    os.register_at_fork(
+        before=_capturing.acquire, after_in_parent=_capturing.release, after_in_child=_capturing.release
+    )
+
+
 @contextmanager
 def captured_stderr() -> Iterator[IO[bytes]]:
-    """Capture what libpng and libjpeg print: it names no file and would break a progress bar."""
-    with tempfile.TemporaryFile() as words:
+    """Capture what libpng and libjpeg print: it names no file and would break a progress bar.
+
+    stderr is the whole process's, so one thread captures at a time.  Where the system has files in memory, no folder of
+    temporary files is needed.
+    """
+    in_memory = hasattr(os, "memfd_create")
+    with _capturing, open(os.memfd_create("stderr"), "w+b") if in_memory else tempfile.TemporaryFile() as words:
         saved = os.dup(STDERR)
         os.dup2(words.fileno(), STDERR)
         try:
