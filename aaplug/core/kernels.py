@@ -4,12 +4,15 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 `rasterizers.tiled.ahead_of_time` compiles the same source into few fused loops.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from aaplug.system.errors import UsageError
 
 BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
 ONE_MORE = "+1"  # suffix of the name of a size
@@ -106,16 +109,40 @@ class Kernels:
         return kernel.function
 
 
-@contextmanager
-def in_full_precision() -> Iterator[None]:
-    """Keep the caller's `torch.autocast` out of the block: bfloat16 has too few digits to place a splat."""
-    with torch.autocast("cpu", enabled=False):
-        yield
-
-
 def materialized(x: Tensor) -> Tensor:
     """x itself.  A compiled kernel then computes it once, in a loop of its own, and not again at each use."""
     return x.as_strided(x.shape, x.stride()) if torch.compiler.is_compiling() else x
 
 
 EAGER = Kernels()
+
+
+def once_differentiable(backward: Callable[..., tuple[Tensor | None, ...]]) -> Callable[..., tuple[Tensor | None, ...]]:
+    """The backward of a `Function`, whose gradients raise UsageError if they are differentiated themselves.
+
+    torch's decorator of this name raises in `backward()` alone; `torch.autograd.grad` leaves them out without a word.
+    """
+
+    @wraps(backward)
+    def tied(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        with torch.no_grad():
+            results = backward(ctx, *grads)
+        if not torch.is_grad_enabled():
+            return results
+        tensors = [x for x in results if x is not None]
+        kept = iter(_Underived.apply(len(tensors), *tensors, *ctx.saved_tensors, *grads))
+        return tuple(x if x is None else next(kept) for x in results)
+
+    return tied
+
+
+class _Underived(torch.autograd.Function):
+    """The first `count` of some tensors, as a function of all of them whose derivative is not known."""
+
+    @staticmethod
+    def forward(ctx: Any, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tensors[:count]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        raise UsageError("gradient", "of a gradient of a render is not known: kernels are differentiated once")

@@ -10,11 +10,10 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
+from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels, once_differentiable
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.splats import Splats2D
 

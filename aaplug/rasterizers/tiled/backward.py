@@ -18,11 +18,10 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels
-from aaplug.core.kernels import Kernel
+from aaplug.core.kernels import Kernel, once_differentiable
 from aaplug.core.runs import starts_of
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows

@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner
+from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner, once_differentiable
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
 MAX_GRADIENT_ROWS = 1 << 15  # whose gradients are computed at once, so that what lies between fits the cache
