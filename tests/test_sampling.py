@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.sampling import check_frame, median_rates, sampling_bounds
+from aaplug.core.sampling import check_frame, median_rates, rates_in_chunks, sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import view_information
 from aaplug.methods.filters.smoothing import Smoothing3D
@@ -125,15 +125,34 @@ def test_view_information_agrees_with_a_loop_in_float64(dtype, offset, tolerance
     torch.testing.assert_close(information.double(), expected, rtol=0, atol=tolerance * expected.abs().max().item())
 
 
-@pytest.mark.parametrize("chunk_pairs", [1, 7, 64, 350, 10**9])
-def test_the_size_of_chunks_changes_nothing(chunk_pairs, monkeypatch):
+@pytest.mark.parametrize("chunk_pairs", [1, 7, 64, 349, 10**9])
+@pytest.mark.parametrize("box", [3, 1024])
+def test_the_size_of_chunks_changes_nothing(chunk_pairs, box, monkeypatch):
     means, cameras = make_scene(50).means * 2, ring()
     whole = sampling_bounds(means, cameras)
     monkeypatch.setattr("aaplug.core.sampling.CHUNK_PAIRS", chunk_pairs)
+    monkeypatch.setattr("aaplug.core.sampling.BOX", box)
     parts = sampling_bounds(means, cameras)
     torch.testing.assert_close(parts.highest, whole.highest, rtol=1e-6, atol=0)
     torch.testing.assert_close(parts.lowest, whole.lowest, rtol=1e-6, atol=0)
     assert parts.views.equal(whole.views)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0], ids=["at the origin", "far from it"])
+def test_of_many_cameras_only_those_that_may_see_a_part_of_the_scene_are_compared_with_it(offset, monkeypatch):
+    """A camera every 10 units of a street, in any order, each of which sees a few units of it."""
+    means = torch.rand(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    means[:, 0] *= 500
+    cameras = [moved(make_camera((0.0, -4.0, 0.0)), (x, 0.0, 0.0)) for x in range(-500, 501, 10)]
+    means, cameras = (means + offset * FAR).float(), [moved(camera, offset * FAR) for camera in cameras]
+    whole = sampling_bounds(means, cameras)
+    monkeypatch.setattr("aaplug.core.sampling.CHUNK_PAIRS", 10_000)
+    monkeypatch.setattr("aaplug.core.sampling.BOX", 20)
+    parts = sampling_bounds(means, cameras)
+    assert 500 < whole.seen.sum() < 2000
+    assert all(map(torch.equal, vars(parts).values(), vars(whole).values()))
+    pairs = sum(rates.numel() for *_, rates in rates_in_chunks(means, cameras))
+    assert pairs < len(means) * len(cameras) / 10
 
 
 def test_bounds_of_a_scene_far_from_the_origin_are_exact():

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.chunks import curve
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR
@@ -24,6 +25,8 @@ from aaplug.system.errors import FrameError, UsageError, counted
 
 IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
+BOX, BOXES = 1024, 256  # Gaussians in a box that is tried against each camera first; boxes that are made at once
+BOX_TOLERANCE = 1e-5  # relative; above the rounding of float32 in the rates
 FRAME_SAMPLE_SIZE = 50_000  # Gaussians of the even sample for the frame check
 
 
@@ -79,18 +82,18 @@ class SamplingBounds:
 def sampling_bounds(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> SamplingBounds:
     """Lowest and highest sampling rate of each Gaussian over the cameras that see it (highest: Mip-Splatting, eq. 7).
 
-    Memory beyond the result and one float64 copy of the means is bounded by `CHUNK_PAIRS`.
+    Memory beyond the result is bounded by `CHUNK_PAIRS`.
     """
     highest, lowest, nearest = (means.new_zeros(len(means)) for _ in range(3))
     focals = means.new_tensor([camera.focal for camera in cameras])
     views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
-    for part, rates in rates_in_chunks(means, cameras):
+    for part, near, rates in rates_in_chunks(means, cameras):
         visible = rates > 0
         views[part] = visible.sum(dim=1, dtype=torch.int32)
         highest[part] = rates.amax(dim=1)
         nearest[part] = focals[0] / highest[part]
         if (focals != focals[0]).any():
-            nearest[part] = (focals / rates).amin(dim=1)
+            nearest[part] = (focals[near] / rates).amin(dim=1)
         lowest[part] = rates.masked_fill_(~visible, torch.inf).amin(dim=1)
     lowest[views == 0] = nearest[views == 0] = 0
     return SamplingBounds(highest, lowest, nearest, views)
@@ -100,7 +103,7 @@ def sampling_bounds(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> S
 def median_rates(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 if none does."""
     median = means.new_zeros(len(means))
-    for part, rates in rates_in_chunks(means, cameras):
+    for part, _, rates in rates_in_chunks(means, cameras):
         median[part] = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values.nan_to_num(0.0)
     return median
 
@@ -138,9 +141,10 @@ def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_shar
 
 def rates_in_chunks(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera]
-) -> Iterator[tuple[slice, Float[Tensor, "c v"]]]:
-    """Yield (chunk of the Gaussians, its rate in every camera); a rate of 0 means "not seen".
+) -> Iterator[tuple[slice | Int[Tensor, " c"], Int[Tensor, " w"], Float[Tensor, "c w"]]]:
+    """Yield (a chunk of the Gaussians, cameras, its rates in these); a rate of 0 means "not seen".
 
+    Each Gaussian is in one chunk, or in none if no camera sees it.  Cameras that see nothing of a chunk may be absent.
     The cameras' mean position is subtracted in float64 first, so that scenes far from the origin keep their digits.
     """
     origin = mean_position(cameras)
@@ -148,21 +152,67 @@ def rates_in_chunks(
     offset = poses[:, :3, 3] + poses[:, :3, :3] @ origin
     rotation, offset, origin = poses[:, :3, :3].to(means), offset.to(means), origin.to(means.device)
     intrinsics = [[c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.focal] for c in cameras]
-    fx, fy, cx, cy, width, height, focal = means.new_tensor(intrinsics).T
-    step = max(1, CHUNK_PAIRS // len(cameras))
-    for start in range(0, len(means), step):
-        part = slice(start, min(start + step, len(means)))
+    intrinsics = means.new_tensor(intrinsics)
+    lenses = {i: camera for i, camera in enumerate(cameras) if camera.lens != PINHOLE}
+    planes = _planes(rotation, offset, intrinsics)
+    for part in _chunks(means, len(cameras), boxed=not lenses):
         local = (means[part].double() - origin).to(means)
-        x, y, z = (torch.addmm(offset[:, i], local, rotation[:, i].T) for i in range(3))
+        near = _may_see(planes, offset, local)
+        near[[*lenses]] = True
+        near = near.nonzero()[:, 0]
+        if not len(near):
+            continue
+        fx, fy, cx, cy, width, height, focal = intrinsics[near].T
+        x, y, z = (torch.addmm(offset[near, i], local, rotation[near, i].T) for i in range(3))
         visible = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
         visible &= _inside(y.div_(z).mul_(fy).add_(cy), height)
         rates = torch.where(visible, focal / z, 0.0)
-        for i, camera in enumerate(cameras):
-            if camera.lens != PINHOLE:
+        for column, i in enumerate(near.tolist() if lenses else ()):
+            if (camera := lenses.get(i)) is not None:
                 places, depths, sampled, _ = sights(means[part], camera)
                 inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
-                rates[:, i] = torch.where((depths > NEAR) & inside, sampled, 0.0)
-        yield part, rates
+                rates[:, column] = torch.where((depths > NEAR) & inside, sampled, 0.0)
+        yield part, near, rates
+
+
+def _chunks(means: Float[Tensor, "n 3"], cameras: int, boxed: bool) -> Iterator[slice | Int[Tensor, " c"]]:
+    """Chunks of the Gaussians; boxed: many lie near each other in each, so that few cameras see any of them."""
+    most = max(1, CHUNK_PAIRS // cameras)
+    if not boxed or len(means) <= most:
+        yield from (slice(start, start + most) for start in range(0, len(means), most))
+        return
+    for some in torch.arange(len(means), device=means.device).split(BOX * BOXES):
+        places = means[some] - means[some].median(dim=0).values
+        usual = places.norm(dim=1).median().clamp(min=torch.finfo(means.dtype).tiny)
+        yield from some[curve(places / (usual + places.abs())).argsort()].split(min(BOX, most))
+
+
+def _planes(
+    rotation: Float[Tensor, "v 3 3"], offset: Float[Tensor, "v 3"], intrinsics: Float[Tensor, "v 7"]
+) -> Float[Tensor, "v 5 4"]:
+    """Sides of what each camera sees as a pinhole: unit normals that point inwards, and the origin's distances."""
+    fx, fy, cx, cy, width, height, _ = intrinsics.T
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    sides = [
+        [zero, zero, one],
+        [fx, zero, cx + IMAGE_MARGIN * width],
+        [-fx, zero, width + IMAGE_MARGIN * width - cx],
+        [zero, fy, cy + IMAGE_MARGIN * height],
+        [zero, -fy, height + IMAGE_MARGIN * height - cy],
+    ]
+    normals = torch.nn.functional.normalize(torch.stack([torch.stack(side, dim=1) for side in sides], dim=1), dim=2)
+    return normals @ torch.cat([rotation, offset[:, :, None]], dim=2)
+
+
+def _may_see(
+    planes: Float[Tensor, "v 5 4"], offset: Float[Tensor, "v 3"], places: Float[Tensor, "c 3"]
+) -> Bool[Tensor, " v"]:
+    """False for a camera if the box around the places lies outside of one of its planes."""
+    low, high = places.aminmax(dim=0)
+    normals, distances = planes[..., :3], planes[..., 3]
+    inmost = (normals * torch.where(normals > 0, high, low)).sum(dim=2) + distances  # of the box's corners
+    size = torch.maximum(low.abs(), high.abs()).norm() + offset.norm(dim=1, keepdim=True)
+    return ~(inmost < -BOX_TOLERANCE * size).any(dim=1)
 
 
 def mean_position(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:

@@ -73,9 +73,9 @@ def view_information(means: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> 
     origin = mean_position(cameras).to(means.device)
     eyes = torch.stack([camera.centre.to(origin) - origin for camera in cameras]).to(means)
     information = means.new_zeros(len(means), 3, 3)
-    for part, rates in rates_in_chunks(means, cameras):
+    for part, near, rates in rates_in_chunks(means, cameras):
         local = (means[part].double() - origin).to(means)
-        rays = torch.nn.functional.normalize(local[:, None] - eyes, dim=2) * rates[:, :, None]
+        rays = torch.nn.functional.normalize(local[:, None] - eyes[near], dim=2) * rates[:, :, None]
         total = rates.square().sum(dim=1)[:, None, None] * torch.eye(3).to(means)
         information[part] = total - rays.mT @ rays
     return information
