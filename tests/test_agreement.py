@@ -22,7 +22,7 @@ from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FrameError
-from tests.conftest import SAMPLE, make_camera, make_scene, write_model
+from tests.conftest import SAMPLE, make_camera, make_scene, moved, write_model
 from tests.scene_files import half_turn_about_x
 
 
@@ -63,6 +63,17 @@ def test_without_photographs_cameras_should_look_at_the_scenes_middle():
     near = [replace(camera, cam_from_world=shrunk(camera.cam_from_world)) for camera in towards]
     found = fit_of(replace(scene, means=scene.means / 100), CameraSet(tuple(near), tuple(near)))
     assert "no Gaussian lies farther ahead than 0.2 units" in found.doubt
+
+
+def test_without_photographs_cameras_over_a_wide_scene_may_each_show_a_part_of_it():
+    scene, sides = make_scene(4000), torch.tensor([60.0, 1.0, 60.0])
+    scene = replace(scene, means=(torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * sides)
+    above = [moved(make_camera(), (x, 0.0, z)) for x in range(-24, 25, 8) for z in range(-24, 25, 8)]
+    found = fit_of(scene, CameraSet(tuple(above), tuple(above)))
+    assert (found.gain, found.doubt) == (None, None)
+    aside = [replace(camera, cx=camera.cx + 0.9 * camera.width) for camera in above]
+    found = fit_of(scene, CameraSet(tuple(aside), tuple(aside)))
+    assert "the middle of the scene lies outside of the image" in found.doubt
 
 
 def test_a_photograph_of_one_colour_tells_nothing(few, sample_cameras, tmp_path: Path):

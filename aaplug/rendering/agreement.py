@@ -1,7 +1,7 @@
 """How well a scene and its cameras fit.
 
 Cameras of another capture may see a scene too, and a scene may be turned over.  Photographs tell at once; without them,
-cameras are expected to look at the scene's middle.
+cameras are expected to look at the scene's middle or, where each shows a part of it alone, at what lies near them.
 """
 
 import math
@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from statistics import median
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from aaplug.core.cameras import CameraSet, spread
+from aaplug.core.cameras import Camera, CameraSet, spread
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
 from aaplug.io.cameras import inria, read_cameras
@@ -28,6 +30,7 @@ PHOTOGRAPHS = 3  # that are compared
 SIDE = 100  # px: longer side of the images that are compared
 FLAT = (0.5 / 255) ** 2  # variance of an image up to which it is one colour, rounded to 8 bits
 LARGEST = 3_000_000  # Gaussians: a larger scene is not rendered for this
+NEAR_SHARE = 0.02  # of the Gaussians ahead, which lie near a camera
 HALF_A_SIDE = 0.5  # distance from the image's centre beyond which the scene's middle is outside of it
 MAX_SIZE_ERROR = 0.02  # relative difference of two training sizes that rounding explains
 MIN_SHARE_LEAD = 0.1  # of Gaussians seen, by which a reading fits better
@@ -39,8 +42,8 @@ class Agreement:
 
     seen: share of the Gaussians that any camera sees.
     size: median standard deviation along a Gaussian's middle axis at its highest training rate, in px; None if unseen.
-    offset: distance of the scene's middle from the image's centre in the median view, as a share of the side; infinite
-        where no Gaussian lies ahead.
+    offset: distance of the scene's middle, or of the middle of what lies near, from the image's centre in the median
+        view, as a share of the side; infinite where no Gaussian lies ahead.
     gain: how much closer renders come to the photographs than one flat colour does, in dB; None without photographs.
     """
 
@@ -77,12 +80,21 @@ def agreement(look: Renderer, cameras: CameraSet) -> Agreement:
     seen = bounds.seen
     middle = scene.scales.median(dim=1).values
     size = float((middle * bounds.highest)[seen].median()) if seen.any() else None
-    offsets = []
-    for camera in spread(look.training.cameras, VIEWS):
-        places, depths = camera.project(scene.means[:: max(1, len(scene) // SAMPLE)])
-        ahead = places[depths > NEAR] / places.new_tensor([camera.width, camera.height])
-        offsets.append(float((ahead.median(dim=0).values - 0.5).abs().max()) if len(ahead) else math.inf)
+    sample = scene.means[:: max(1, len(scene) // SAMPLE)]
+    offsets = [_offset(sample, camera) for camera in spread(look.training.cameras, VIEWS)]
     return Agreement(float(seen.float().mean()), size, median(offsets), _gain(look, cameras))
+
+
+def _offset(means: Float[Tensor, "n 3"], camera: Camera) -> float:
+    """`Agreement.offset` in one view: of the middle of all that lies ahead, or of the nearer part, as is smaller."""
+    places, depths = camera.project(means)
+    ahead = depths > NEAR
+    if not ahead.any():
+        return math.inf
+    places = places[ahead] / places.new_tensor([camera.width, camera.height])
+    distances = (means[ahead].double() - camera.centre).norm(dim=1)
+    near = places[distances <= distances.quantile(NEAR_SHARE)]
+    return min(float((part.median(dim=0).values - 0.5).abs().max()) for part in (places, near))
 
 
 def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scene:
