@@ -20,6 +20,7 @@ from aaplug.io.scenes import (
     OWN,
     SCENE_FORMATS,
     WritableFormat,
+    codebooks,
     find_scene,
     ply,
     read_scene,
@@ -31,7 +32,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, make_scene, memory_taken, needs_peak_memory
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file, write_json
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
@@ -367,7 +368,7 @@ def test_spz_holds_the_ends_of_its_ranges(tmp_path: Path, expected):
     [
         ({"flat": True}, "2D Gaussians"),
         ({"filter_3d": torch.ones(40)}, "filter_3D"),
-        ({"means": torch.full((40, 3), 1e9)}, "as far as 1e"),
+        ({"means": torch.full((40, 3), 1e9)}, r"as far as 1e\+09 from the origin; move the scene by aaplug merge, or"),
     ],
 )
 def test_spz_says_what_it_cannot_hold(tmp_path: Path, expected, changes, problem):
@@ -581,3 +582,39 @@ def test_real_compressed_scenes_are_read(shared_data, name: str, n: int, degree:
     scene = read_scene(shared_data / "formats" / name).gaussians()
     assert (len(scene), scene.sh_degree) == (n, degree)
     assert scene.means.isfinite().all()
+
+
+@pytest.mark.parametrize("suffix", ["compressed.ply", "sog"])
+def test_the_size_of_blocks_changes_nothing_that_is_written(tmp_path: Path, monkeypatch, suffix: str):
+    scene = make_scene(300, degree=2)
+    write_scene(tmp_path / f"whole.{suffix}", scene)
+    monkeypatch.setattr("aaplug.io.scenes.codebooks.BLOCK_ROWS", 7)
+    monkeypatch.setattr("aaplug.io.scenes.compressed_ply.PART", 7)
+    write_scene(tmp_path / f"blocks.{suffix}", scene)
+    whole, blocks = (read_scene(tmp_path / f"{name}.{suffix}").gaussians() for name in ("whole", "blocks"))
+    assert all(torch.equal(column, blocks.columns[name]) for name, column in whole.columns.items())
+
+
+def test_rows_lie_along_their_main_direction_whatever_the_size_of_blocks(monkeypatch):
+    rows = torch.randn(1000, 24, generator=torch.Generator().manual_seed(0)) * torch.linspace(1, 5, 24)
+    expected = codebooks._along(rows)
+    monkeypatch.setattr("aaplug.io.scenes.codebooks.BLOCK_ROWS", 7)
+    assert torch.equal(codebooks._along(rows), expected)
+
+
+COUNT = 80_000  # Gaussians of degree 3: 19 MB
+LARGE = """
+from aaplug.evaluation.laws.base import make_scene
+from aaplug.io.scenes import compressed_ply, write_scene
+path = {path!r}
+write_scene(path, make_scene(2000, degree=3))
+compressed_ply.PART = 4096
+large = make_scene({count}, degree=3)
+"""
+
+
+@needs_peak_memory
+def test_memory_holds_harmonics_few_times_while_a_compressed_ply_is_written(tmp_path: Path):
+    prepare = LARGE.format(path=str(tmp_path / "a.compressed.ply"), count=COUNT)
+    [taken] = memory_taken(prepare, "write_scene(path, large, overwrite=True)")
+    assert taken < 5.5 * 4 * 59 * COUNT

@@ -13,6 +13,7 @@ from aaplug.system.executors import torch_threads
 VALUE_STEPS, ROW_STEPS = 30, 6  # of Lloyd's algorithm
 COARSE, MIN_GROUP = 256, 64  # groups of rows, each of which gets a codebook of its own; rows of a group
 BLOCK = 1 << 24  # distances computed at once: 64 MB
+BLOCK_ROWS = 1 << 16  # rows held in float64 at once: 24 MB of harmonics of degree 3
 
 
 def codebook(values: Float[Tensor, " n"], entries: int) -> Float[Tensor, " entries"]:
@@ -68,9 +69,10 @@ def palette(rows: Float[Tensor, "n c"], entries: int) -> tuple[Float[Tensor, "p 
 
 def _along(rows: Float[Tensor, "n c"]) -> Int[Tensor, " n"]:
     """The order of rows along the direction in which they differ most."""
-    centred = (rows - rows.mean(dim=0)).double()
-    main = torch.linalg.eigh(centred.T @ centred).eigenvectors[:, -1]
-    return (centred @ main).argsort(stable=True)
+    mean, blocks = rows.mean(dim=0), rows.split(BLOCK_ROWS)
+    scatter = torch.stack([(centred := (block - mean).double()).T @ centred for block in blocks]).sum(dim=0)
+    main = torch.linalg.eigh(scatter).eigenvectors[:, -1]
+    return torch.cat([(block - mean).double() @ main for block in blocks]).argsort(stable=True)
 
 
 def _lloyd(rows: Float[Tensor, "n c"], entries: int) -> tuple[Float[Tensor, "p c"], Int[Tensor, " n"]]:

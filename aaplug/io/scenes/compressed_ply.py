@@ -25,7 +25,7 @@ from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.record import warn_of_moves, warn_of_sizes, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
-from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes.scene import PART, Scene
 from aaplug.system.errors import FormatError
 
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -141,9 +141,8 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     columns = {"chunk": [*BOUNDS, *SCALE_BOUNDS, *COLOUR_BOUNDS], "vertex": list(WORDS)}
     tables = [torch.cat(bounds, dim=1).numpy().astype("<f4"), torch.stack(words, dim=1).numpy().astype("<u4")]
     if scene.sh_degree:
-        steps = ((scene.sh[:, 1:].transpose(1, 2).flatten(1) / SH_SPAN + 0.5) * 256).floor()
-        columns["sh"] = [f"f_rest_{i}" for i in range(steps.shape[1])]
-        tables.append(bytes_of(steps))
+        tables.append(np.concatenate([_harmonic_bytes(sh) for sh in scene.sh.split(PART)]))
+        columns["sh"] = [f"f_rest_{i}" for i in range(tables[-1].shape[1])]
     kinds = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
     lines = ["ply", f"format {LITTLE} 1.0"]
     for (element, names), table in zip(columns.items(), tables, strict=True):
@@ -153,6 +152,11 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
         stream.write(header.content)
         for table in tables:
             stream.write(table.tobytes())
+
+
+def _harmonic_bytes(sh: Float[Tensor, "n k 3"]) -> np.ndarray:
+    """Rows of the table of harmonics."""
+    return bytes_of(((sh[:, 1:].transpose(1, 2).flatten(1) / SH_SPAN + 0.5) * 256).floor())
 
 
 def _bounded(

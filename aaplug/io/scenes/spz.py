@@ -269,7 +269,8 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     farthest = max(float(part.means.abs().max()) if len(part) else 0.0 for part in scenes)
     fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
     if fraction < 1:
-        raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
+        where = f"positions as far as {farthest:g} from the origin"
+        raise OutputError(path, f"cannot hold {where}; move the scene by aaplug merge, or write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
     moves = [(part.means * 2**fraction).round() / 2**fraction - part.means for part in scenes]
     warn_of_moves(path, name, [*zip(scenes, moves, strict=True)])
