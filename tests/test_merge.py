@@ -16,12 +16,13 @@ from aaplug.core.placing import mirrored, placed
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.training import TrainingViews
+from aaplug.io.limits import Memory
 from aaplug.io.scenes import read_scene
 from aaplug.methods.conversion import carried
 from aaplug.rendering.agreement import photo_of
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError
-from tests.conftest import moved
+from tests.conftest import make_scene, moved
 from tests.scene_files import oracle
 
 WHITE = (1.0, 1.0, 1.0)
@@ -104,6 +105,14 @@ def test_degrees_records_and_places_are_brought_together():
 def test_places_that_do_not_fit_are_refused(options, problem):
     with pytest.raises(UsageError, match=problem):
         aaplug.merge([oracle(), oracle()], **options)
+
+
+def test_all_scenes_together_should_fit_into_memory(monkeypatch):
+    scene = make_scene(1000)
+    monkeypatch.setattr("aaplug.io.limits.usable_memory", lambda: Memory(3e5, "this machine's {}"))
+    assert len(aaplug.merge([scene])) == 1000
+    with pytest.raises(UsageError, match=r"scenes: their 2,000 Gaussians take .* more than 50% of this machine's"):
+        aaplug.merge([scene, scene])
 
 
 def test_discs_and_ellipsoids_do_not_mix():

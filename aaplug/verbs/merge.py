@@ -15,10 +15,12 @@ from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import placed
 from aaplug.io.atomic import AnyPath
+from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import check_scene_output, scene_of, write_scene
 from aaplug.io.scenes.faults import check_values
 from aaplug.io.scenes.packed import of_degree
 from aaplug.io.scenes.ply import beside
+from aaplug.io.scenes.scene import memory_of
 from aaplug.methods.conversion import carried
 from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -44,8 +46,8 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
         output: file to write, of a format that can be written; None writes none.
 
     Raises:
-        AaplugError: as `render`; also, some scenes hold 2D Gaussians and others do not, or there are not as many moves,
-            turns or scales as scenes.
+        AaplugError: as `render`; also, some scenes hold 2D Gaussians and others do not, there are not as many moves,
+            turns or scales as scenes, or all scenes together take more than the limit MEMORY_SHARE.
     """
     opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if not opened:
@@ -53,6 +55,9 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
     if len({scene.flat for scene in opened}) > 1:
         raise UsageError("scenes", "some hold 2D Gaussians and others do not; one file cannot hold both")
     places = list(zip(*_places(options, len(opened)), strict=True))
+    count, degree = sum(scene.count for scene in opened), max(scene.sh_degree for scene in opened)
+    if lacking := lack_of_memory(memory_of(count, degree)):
+        raise UsageError("scenes", f"their {count:,} Gaussians take {lacking}; AAPLUG_MEMORY_SHARE=1 allows all")
     own = {scene.convention for scene in opened}
     into = CONVENTIONS[options.into] if options.into else own.pop() if len(own) == 1 else MIP
     jobs = [None if scene.convention == into else Job.of(scene, cameras, options) for scene in opened]
@@ -74,7 +79,7 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
             if lost := beside(part):
                 options.monitor.say(f"{scene.title}: the merged scene does not have its {lost}")
             parts.append(replace(placed(part, turn, scale, move), extras={}, origin=None))
-        degree, fused = max(part.sh_degree for part in parts), {str(f): f for part in parts for f in part.fused}
+        fused = {str(f): f for part in parts for f in part.fused}
         merged = joined([replace(of_degree(part, degree), fused=tuple(fused.values())) for part in parts])
         check_values(merged)
         if path is not None:

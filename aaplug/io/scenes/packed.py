@@ -145,7 +145,8 @@ def standing(scene: Gaussians, motion: Float[Tensor, "4 4"], place: Place) -> Ga
 
 def of_degree(scene: Gaussians, degree: int) -> Gaussians:
     """The scene with harmonics up to this degree: those above are left out, those that it lacks are 0."""
-    missing = (degree + 1) ** 2 - scene.sh.shape[1]
+    if not (missing := (degree + 1) ** 2 - scene.sh.shape[1]):
+        return scene
     return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))
 
 

@@ -266,11 +266,11 @@ class Scene:
     @property
     def harmonics_bytes(self) -> int:
         """Bytes that the harmonics take in memory."""
-        return self.count * FLOAT * 3 * (self.sh_degree + 1) ** 2
+        return memory_of(self.count, self.sh_degree) - memory_of(self.count)
 
     def check_memory(self, harmonics: bool = True) -> None:
         """Refuse a scene above the limit MEMORY_SHARE of the machine's memory, with or without harmonics."""
-        needed = self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes * harmonics
+        needed = memory_of(self.count, self.sh_degree) if harmonics else memory_of(self.count)
         if lacking := lack_of_memory(needed):
             hint = "info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all"
             raise FormatError(self.name, f"its {self.count:,} Gaussians take {lacking}; {hint}")
@@ -324,6 +324,11 @@ class SceneFrames:
         if len(frame) != (count := len(training.bounds.views)):
             raise UsageError(frame.name, f"expected {count:,} Gaussians, as in the frames before, got {len(frame):,}")
         return training
+
+
+def memory_of(count: int, degree: int | None = None) -> int:
+    """Bytes that so many Gaussians take in memory; degree: of their harmonics, None without any."""
+    return count * FLOAT * (SHAPE_NUMBERS + (0 if degree is None else 3 * (degree + 1) ** 2))
 
 
 def held_rows(held: Gaussians, start: int, stop: int) -> Gaussians:
