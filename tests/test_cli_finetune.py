@@ -39,7 +39,7 @@ def test_finetune_without_steps_changes_no_byte(cli):
 def test_finetune_says_where_it_made_the_measured_views_worse(cli, rate, worse):
     how = f"--scale 0.5 --steps 1 --learning-rate {rate} --rasterizer eager"
     _, err = cli.done(f"finetune scene.ply --cameras . -o tuned.ply {how}")
-    assert ("worse than before at 1" in " ".join(err.split())) == worse, err
+    assert ("worse than before at 1, 1/2: " in " ".join(err.split())) == worse, err
 
 
 def test_an_upsampler_is_for_scales_above_the_photographs(cli):

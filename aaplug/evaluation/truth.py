@@ -20,7 +20,7 @@ from torch import Tensor
 
 from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import Camera
-from aaplug.core.imaging import quantised, resampled
+from aaplug.core.imaging import levels, quantised, resampled
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
 from aaplug.evaluation.protocols import Protocol, TruthSource
@@ -32,7 +32,7 @@ from aaplug.system.errors import UsageError
 
 NO_PHOTOGRAPH = "has no photograph; `truth` self compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
-CACHE_DTYPE = torch.float16  # 11 significant bits, against the 8 that are compared
+CACHE_DTYPE, CACHE_BITS = torch.uint16, 16  # 8-bit images are the same when rounded from 16 bits: 65535 is 257 x 255
 SLAB_SIZE = 1 << 25  # numbers of the cache allocated at once: 64 MB
 
 Larger = Float[Tensor, "H W 3"]
@@ -81,7 +81,7 @@ class Truth:
     renderer: renders the scene by training's rule (see `rendering.renderer.own_look`), or the reference by its recipe.
     enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
         photographs, undefined.
-    memory: bytes of float16 images to cache between calls; None caches none.
+    memory: bytes of 16-bit images to cache between calls; None caches none.
     """
 
     renderer: Renderer
@@ -124,8 +124,7 @@ class ViewTruth:
     def compared(self, scale: float) -> Image | None:
         """The image that renders are compared with, None if undefined; the scene's own are rounded to 8 bits."""
         image = self.image(scale)
-        rounds = self.truth.source != "photographs" or self.truth.memory is not None
-        return quantised(image) if image is not None and rounds else image
+        return image if image is None or self.truth.source == "photographs" else quantised(image)
 
     def image(self, scale: float) -> Image | None:
         """The truth at a scale, before rounding; None where there is none.  It is cached while there is room."""
@@ -134,20 +133,20 @@ class ViewTruth:
             return self._image(scale)
         pose = view.cam_from_world.detach().cpu().numpy().tobytes()
         key = scale, *(vars(view) | {"cam_from_world": pose, "name": None}).values()  # names recur in other splits
-        if key in truth.cache:
-            return truth.cache[key].float()
-        new = self._image(scale)
-        if new is None:
-            return None
-        image = new.to(CACHE_DTYPE)
-        if sum(cached.nbytes for cached in truth.cache.values()) + image.nbytes <= truth.memory:
-            # in a slab: small blocks that stay, between large ones that go, would keep those from the system
-            size = image.numel()
-            if not truth.slab or len(truth.slab[0]) < size:
-                truth.slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
-            place, truth.slab[0] = truth.slab[0].split([size, len(truth.slab[0]) - size])
-            truth.cache[key] = place.view(image.shape).copy_(image)
-        return image.float()
+        image = truth.cache.get(key)
+        if image is None:
+            new = self._image(scale)
+            if new is None:
+                return None
+            image = levels(new, CACHE_BITS).to(CACHE_DTYPE)
+            if sum(cached.nbytes for cached in truth.cache.values()) + image.nbytes <= truth.memory:
+                # in a slab: small blocks that stay, between large ones that go, would keep those from the system
+                size = image.numel()
+                if not truth.slab or len(truth.slab[0]) < size:
+                    truth.slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
+                place, truth.slab[0] = truth.slab[0].split([size, len(truth.slab[0]) - size])
+                truth.cache[key] = place.view(image.shape).copy_(image)
+        return image.float() / (2**CACHE_BITS - 1)
 
     def _image(self, scale: float) -> Image | None:
         truth, camera = self.truth, self.camera(scale)

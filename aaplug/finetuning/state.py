@@ -33,7 +33,7 @@ from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
-FORMAT, VERSION = "aaplug finetune", 8  # of a checkpoint
+FORMAT, VERSION = "aaplug finetune", 9  # of a checkpoint
 
 
 @dataclass(frozen=True, eq=False)

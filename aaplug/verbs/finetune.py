@@ -18,8 +18,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import sheet_of
-from aaplug.evaluation.results import Report, results, scale_name
-from aaplug.evaluation.results import mean as mean_of
+from aaplug.evaluation.results import Report, figure_of, results, scale_name
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
@@ -140,7 +139,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         with job.monitor.progress("measuring", "views") as tell:
             report = evaluate(Task(renderers, scales, job.views, truth, ceiling=False), tell=tell)
         for name in ("before", *closed) if state.step else ():
-            psnr = ([mean_of(report.select(row, s), PSNR.name) for row in (name, "after")] for s in scales)
+            psnr = ([figure_of(PSNR, report.select(row, s)) for row in (name, "after")] for s in scales)
             lost = (was - now if was and now else 0.0 for was, now in psnr)
             worse = [scale_name(scale) for scale, dB in zip(scales, lost, strict=True) if round(dB, PSNR.digits) > 0]
             if worse:

@@ -48,7 +48,7 @@ MEGABYTE = 1e6
 # At most, of the header of a .ply: the records of merging and tuning, and what it says of a column.
 RECORDS_BYTES, COLUMN_BYTES = 1500, 24
 SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
-MERGING_RULE = 3  # raised when merging or tuning changes, so that levels of two rules are not mixed
+MERGING_RULE = 4  # raised when merging or tuning changes, so that levels of two rules are not mixed
 NORMAL_COLUMNS = 3  # that a .ply has beside a Gaussian's parameters
 
 
