@@ -21,7 +21,7 @@ from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.fitting import fit
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
-from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, l2
+from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, l2, slowed
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
 from aaplug.lab import mipmap_gs
@@ -432,6 +432,28 @@ def test_balanced_weights_are_against_the_roots_of_errors():
     found = balance(QUICK_SETTINGS, errors)
     assert found.weights == pytest.approx({0.5: 50.0, 0.25: 10.0, 0.125: 1.0})
     assert found.anchor == pytest.approx(QUICK_SETTINGS.anchor * 100)
+
+
+def test_rates_are_lower_in_proportion_where_the_start_is_close():
+    settings = replace(QUICK_SETTINGS, weights={1.0: 1.0, 0.5: 3.0}, anchor=2.0, usual_error=0.02)
+    for root, share in ((0.04, 1.0), (0.02, 1.0), (0.005, 0.25), (0.0, 0.0)):
+        for errors in ({1.0: root**2, 0.5: root**2}, {1.0: 0.0, 0.5: root**2 * (0.5 + 2 + 1.5) / 1.5}):
+            found = slowed(settings, errors).rates
+            assert found == pytest.approx({name: share * rate for name, rate in settings.rates.items()})
+    assert slowed(replace(settings, usual_error=0.0), {1.0: 0.0, 0.5: 0.0}).rates == settings.rates
+
+
+def test_a_scene_that_is_close_is_tuned_slowly(monkeypatch):
+    scene = make_scene(40, seed=4)
+    scene = replace(scene, log_scales=scene.log_scales.clamp(min=-0.7))  # several pixels: right at half the size, too
+    settings = {"scale": (0.5,), "steps": 2, "rasterizer": "eager", "views": "view0"}
+    curve = finetune(scene, CameraSet(VIEWS, VIEWS, background=GREY), **settings).curve
+    assert curve[1]["loss"][0.5] < 2 * curve[0]["loss"][0.5]
+    tuning = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("aaplug.finetuning.fitting.tune", tuning)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, VIEWERS["mip"], make_job().truth.renderer.showing(scene), VIEWS, 1)
+    assert tuning.call_args.args[0].settings.rates["dc"] < 0.5 * QUICK_SETTINGS.rates["dc"]
 
 
 def test_a_run_begins_without_a_file_among_the_temporary_ones(tmp_path, monkeypatch):

@@ -137,6 +137,12 @@ def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     return _mean(m.values.get(metric) for m in measurements)
 
 
+def mean_square_error(measurements: Iterable[Measurement]) -> float:
+    """The one of the mean PSNR over the views that do not equal their truth; 0 where all do."""
+    psnr = mean(measurements, PSNR.name)
+    return 0.0 if psnr is None else 10 ** (-psnr / 10)
+
+
 def figure_of(metric: Metric, measurements: Sequence[Measurement]) -> float | None:
     """The mean as people read it: infinity where every image equals its truth and the metric is infinite there."""
     equal = measurements and metric.undefined == EQUAL and all(EQUAL in m.note for m in measurements)

@@ -12,12 +12,11 @@ from statistics import fmean
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.engine import Task, evaluate
-from aaplug.evaluation.metrics import PSNR
-from aaplug.evaluation.results import Report, mean
+from aaplug.evaluation.results import Report, mean_square_error
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance
+from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance, slowed
 from aaplug.finetuning.state import TuningJob
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
@@ -62,9 +61,8 @@ def fit(
         return before.with_more(measure({CONVERTED: replace(original, scene=result)}))
 
     def errors_of(report: Report, name: str) -> dict[float, float]:
-        """Mean square error of a row by scale, of its mean PSNR, as a mean over the rules."""
-        psnr = {s: [mean(report.select(name + by, s), PSNR.name) for by in recipes] for s in report.scales}
-        return {s: fmean(0.0 if dB is None else 10 ** (-dB / 10) for dB in values) for s, values in psnr.items()}
+        """Mean square error of a row by scale, as a mean over the rules."""
+        return {s: fmean(mean_square_error(report.select(name + by, s)) for by in recipes) for s in report.scales}
 
     def is_worse(report: Report, name: str) -> bool:
         before, after = (errors_of(report, row) for row in (ORIGINAL, name))
@@ -74,16 +72,18 @@ def fit(
         errors = errors_of(report, name)
         return settings.anchor * errors[1.0] + sum(weight * errors[s] for s, weight in settings.weights.items())
 
-    closed_form = start = replace(original, scene=fuse_for(scene, original.training, viewer))
+    closed_form = replace(original, scene=fuse_for(scene, original.training, viewer))
     renderers = {ORIGINAL: original, CLOSED_FORM: closed_form}
     before = measure(renderers)
+    start = CLOSED_FORM
     if steps and is_worse(before, CLOSED_FORM):
         problem = "the closed form is worse than the original at some scale"
         monitor.say(f"{problem}: starting from the original")
-        start = original
+        start = ORIGINAL
     usual = SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS
     settings = balance(replace(usual, steps=steps), errors_of(before, ORIGINAL))
-    job = TuningJob(start, original.training.cameras, truth, settings, recipes=[*recipes.values()])
+    slow = slowed(settings, errors_of(before, start))
+    job = TuningJob(renderers[start], original.training.cameras, truth, slow, recipes=[*recipes.values()])
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
     report = report_of(result) if steps else as_converted(CLOSED_FORM)
@@ -99,7 +99,7 @@ def fit(
     problem = ""
     if state.step and is_worse(report, CONVERTED):
         problem = "still worse than the original at some scale"
-    elif state.step and start is closed_form and losses[CONVERTED] >= losses[CLOSED_FORM]:
+    elif state.step and start == CLOSED_FORM and losses[CONVERTED] >= losses[CLOSED_FORM]:
         problem = "tuning did not bring it closer, over all scales"
     if problem:
         kept = min(CLOSED_FORM, ORIGINAL, key=losses.__getitem__)

@@ -20,7 +20,7 @@ from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run, view_and_weights
-from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, TUNING_RATES, balance
+from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, TUNING_RATES, balance, slowed
 from aaplug.finetuning.state import State, TuningJob, begin, part_of
 from aaplug.io.rad import node_sizes, shown_of
 from aaplug.methods.conversion import TUNED
@@ -38,9 +38,7 @@ BYTES_PER_PIXEL = 6
 # The tuned views take these sizes in turn, as multiples of the training size.  A level is drawn alone at 1 to 3/2 times
 # its own rate and fades out below, so it learns these rates.  Its truth has the same sizes: whole boxes do not blur
 VIEW_SIZES = (1.0, 1.5, 1.0, 1.22, 1.5, 1.0, 1.22, 0.84)
-# Root mean square error, of colours in [0, 1].  A level that is closer has lower learning rates in proportion, because
-# a step leaves noise in proportion to its length
-USUAL_ERROR = 0.02
+USUAL_ERROR = 0.02  # see `Settings`; at the level's own size, where errors are larger than at the training size
 USUAL_STEPS_RATE = 1 / 4  # of the training rate: coarser levels take more steps, in inverse proportion
 MAX_STEPS_FACTOR = 8.0
 SMALLER_WEIGHT = 0.5  # of the loss at each of the smaller sizes, where errors are larger
@@ -81,10 +79,10 @@ def refine(
     before = _error(start, truth, probes, rate)
     if before < CLOSE_ENOUGH:
         return level
-    share = min(1.0, before**0.5 / USUAL_ERROR)
-    rates = {name: share * (1 / rate if name == "means" else 1) * r for name, r in TUNING_RATES.items()}
+    rates = TUNING_RATES | {"means": TUNING_RATES["means"] / rate}
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
     settings = replace(CONSISTENCY_SETTINGS, name="levels", steps=steps, weights=weights, rates=rates, anchor=0.0)
+    settings = slowed(replace(settings, usual_error=USUAL_ERROR), dict.fromkeys((1.0, *weights), before))
     scene = _tuned(TuningJob(start, views, truth, settings), monitor)
     if _error(look.showing(scene), truth, probes, rate) >= before:
         return level

@@ -26,6 +26,7 @@ class Settings:
     rates: learning rate by parameter; a parameter without one stays fixed.
     decay: factor that the learning rates have reached at the end.
     averaged: share of the steps, the last ones, whose mean is the result.
+    usual_error: root mean square error of colours in [0, 1], from which on `slowed` leaves the rates as they are.
     loss: a name in `LOSSES`.
     """
 
@@ -36,6 +37,7 @@ class Settings:
     anchor: float = 0.0
     decay: float = 1.0
     averaged: float = 0.0
+    usual_error: float = 0.0
     loss: str = "l2"
     seed: int = 0
 
@@ -44,7 +46,7 @@ class Settings:
 TUNING_FACTORS = {"means": 0.1, "quats": 1.0, "log_scales": 3.6, "logit_opacities": 3.0, "dc": 3.6, "rest": 1.5}
 TUNING_RATES = {name: factor * RATES[name] for name, factor in TUNING_FACTORS.items()}
 CONSISTENCY_SETTINGS = Settings(
-    "consistency", 1000, LOSS_WEIGHTS, TUNING_RATES, anchor=ANCHOR_WEIGHT, decay=0.3, averaged=0.5
+    "consistency", 1000, LOSS_WEIGHTS, TUNING_RATES, anchor=ANCHOR_WEIGHT, decay=0.3, averaged=0.5, usual_error=0.01
 )
 # Conversion takes a few minutes by these; `balance` divides the weights by the scene's errors
 QUICK_SETTINGS = replace(
@@ -63,6 +65,18 @@ def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
     roots = {scale: max(ROUNDING_ERROR, error) ** 0.5 for scale, error in errors.items()}
     weights = {scale: weight / roots[scale] for scale, weight in settings.weights.items()}
     return replace(settings, weights=weights, anchor=settings.anchor / roots[1.0])
+
+
+def slowed(settings: Settings, errors: Mapping[float, float]) -> Settings:
+    """Lower the learning rates of a start that is close, since a step leaves noise in proportion to its length.
+
+    errors: mean square error of the start by scale; errors[1.0] is the anchor's.
+    """
+    weights = {scale: weight / len(settings.weights) for scale, weight in settings.weights.items()}
+    weights[1.0] = weights.get(1.0, 0.0) + settings.anchor
+    error = sum(weight * errors[scale] for scale, weight in weights.items()) / sum(weights.values())
+    share = min(1.0, error**0.5 / settings.usual_error) if settings.usual_error else 1.0
+    return replace(settings, rates={name: share * rate for name, rate in settings.rates.items()})
 
 
 def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:

@@ -11,21 +11,21 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import sheet_of
-from aaplug.evaluation.results import Report, figure_of, results, scale_name
+from aaplug.evaluation.results import Report, figure_of, mean_square_error, results, scale_name
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
 from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.poses import refined
-from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import Settings, settings_of
+from aaplug.finetuning.session import PROBE_VIEWS, tune, tuned_scene
+from aaplug.finetuning.settings import Settings, settings_of, slowed
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, write_file
 from aaplug.io.images import image_size, write_png
@@ -115,6 +115,10 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             fused = replace(fused, extras={**zeros, **fused.extras})
         start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
+        scales = sorted({1.0, *settings.weights}, reverse=True)
+        if settings.steps and settings.usual_error:
+            first = evaluate(Task({"start": start}, scales, spread(train, PROBE_VIEWS), truth, (PSNR,), ceiling=False))
+            settings = slowed(settings, {s: mean_square_error(first.select("start", s)) for s in scales})
         tuning = TuningJob(start, train, truth, settings, upsampler, method)
         steps = f"{settings.name}, {counted(settings.steps, 'step')}, truth: {truth_source}"
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
@@ -134,7 +138,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         bounds = sampling_bounds(written.means, train)  # densification may have changed the number of Gaussians
         after = replace(start, scene=written, training=replace(start.training, bounds=bounds))
         renderers = {"before": before, **closed, "after": after}
-        scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(truth, source=source_of(job.views))
         with job.monitor.progress("measuring", "views") as tell:
             report = evaluate(Task(renderers, scales, job.views, truth, ceiling=False), tell=tell)
