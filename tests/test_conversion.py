@@ -139,6 +139,8 @@ def test_discs_are_smoothed_within_their_planes_and_stay_discs(cameras, tmp_path
     for options in ({"form": "matched-energy"}, {"viewer": "spark"}):
         with pytest.raises(UsageError, match=r"2D Gaussians.*form mip-splatting smooths them"):
             aaplug.convert(scene, CameraSet(tuple(cameras), ()), None, min_seen=0.0, **options)
+    with pytest.raises(UsageError, match=r"2D Gaussians"):  # `matched`, the usual rule of fine-tuning, draws no discs
+        aaplug.finetune(scene, CameraSet(tuple(cameras), ()), None, min_seen=0.0, views="train", steps=0)
 
 
 def test_a_format_that_no_viewer_opens_is_told():

@@ -55,11 +55,11 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
 
     If the viewer draws as training did, only a stored 3D filter is fused.
 
-    Raises UsageError if the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
+    Raises UsageError if the scene holds 2D Gaussians, or the viewer has a rule of its own and blur is already fused.
     """
+    _check_discs(scene)
     if viewer.convention is None:
         return fuse_stored(scene)
-    _check_discs(scene)
     _check_unblurred(scene)
     scene = fuse_stored(viewer.shown(scene))
     trained, shown = scene.convention, viewer.convention
