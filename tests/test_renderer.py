@@ -14,6 +14,7 @@ from aaplug.core.colours import WHITE
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.imaging import average_samples, box_average
 from aaplug.core.lenses import Lens
+from aaplug.core.passes import PASSES
 from aaplug.core.projection import project
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
@@ -131,6 +132,18 @@ def test_autocast_changes_nothing(recipe, cameras):
     expected = drawn()
     with torch.autocast("cpu"):
         assert all(map(torch.equal, drawn(), expected))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_the_default_precision_of_a_program_changes_nothing(dtype, cameras):
+    renderer, view = Renderer.of(make_scene(30), cameras), cameras[0].scaled(1 / 2)
+    expected = renderer.passes(view, [*PASSES])
+    torch.set_default_dtype(dtype)
+    try:
+        found = Renderer.of(renderer.source, cameras).passes(view, [*PASSES])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert all(found[name].equal(expected[name]) for name in PASSES)
 
 
 def test_paths_are_read(sample_cameras):

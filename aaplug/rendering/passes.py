@@ -92,7 +92,7 @@ def expected(
     layers = dict(zip(channels, parts, strict=True))
     if "depth" in layers:
         height, width = image.alpha.shape
-        x, y = (torch.arange(side, device=image.alpha.device) + 0.5 for side in (width, height))
+        x, y = (torch.arange(side).to(image.alpha) + 0.5 for side in (width, height))
         at_corner, right, down = layers["depth"].unbind(dim=2)
         depth = at_corner + x * right + y[:, None] * down
         rays = camera.rays(torch.stack([x.expand_as(depth), y[:, None].expand_as(depth)], dim=2))
