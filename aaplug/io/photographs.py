@@ -69,8 +69,7 @@ def read_photo(
     path: str | PathLike[str], background: Background, undistortion: Undistortion | None = None
 ) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
-    image = undistorted(read_image(path, background), undistortion)
-    return quantised(image)
+    return quantised(undistorted(read_image(path, background), undistortion))
 
 
 def photo_of(view: Camera, background: Background) -> Callable[[Camera], Float[Tensor, "h w 3"]]:

@@ -65,8 +65,7 @@ def write_page(
     from aaplug.evaluation.report.webpage import page
 
     figures = plots(report, bounds)
-    text = page(name, report, bounds, figures, images, facts)
-    paths = write_texts(folder, {PAGE: text}, overwrite)
+    paths = write_texts(folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
     beside = make_folder(Path(folder) / PLOTS)
     for plot in figures:
         for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
