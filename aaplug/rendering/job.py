@@ -6,17 +6,19 @@ claims the output and connects the workers.
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.core.colours import BLACK, WHITE
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import TakesMemory
+from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
@@ -223,6 +225,24 @@ class Workers:
     def pool(self) -> Executor:
         """The cluster, or processes of this machine where views take long."""
         return self.cluster or ProcessesIfLong(self.threads)
+
+
+def detached(value: Any) -> Any:
+    """An argument of a verb, without what autograd knows of Gaussians and poses."""
+    if isinstance(value, Gaussians) and any(column.requires_grad for column in value.columns.values()):
+        return replace(value, **{name: column.detach() for name, column in value.columns.items()})
+    if isinstance(value, Pyramid):
+        return value if (scene := detached(value.scene)) is value.scene else replace(value, scene=scene)
+    if isinstance(value, Scene) and value.path is None:
+        held = value.levels or value.gaussians()
+        return value if (free := detached(held)) is held else Scene.in_memory(free)
+    if isinstance(value, Camera) and value.cam_from_world.requires_grad:
+        return replace(value, cam_from_world=value.cam_from_world.detach())
+    if isinstance(value, CameraSet):
+        return replace(value, train=tuple(map(detached, value.train)), test=tuple(map(detached, value.test)))
+    if isinstance(value, Mapping):
+        return {name: detached(each) for name, each in value.items()}
+    return [*map(detached, value)] if isinstance(value, list | tuple) else value
 
 
 @contextmanager

@@ -6,7 +6,6 @@ keywords of the verb, and so do `help` and the API's pages.
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial, wraps
 from os import PathLike
 from types import NoneType
@@ -14,14 +13,10 @@ from typing import Any, ParamSpec, Protocol, TypeVar, get_args, get_type_hints
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import AnyPath, check_name
 from aaplug.io.scenes import SceneLike
-from aaplug.io.scenes.scene import Scene
 from aaplug.options.base import Options, documented
-from aaplug.rendering.job import CamerasLike
+from aaplug.rendering.job import CamerasLike, detached
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError, did_you_mean
 from aaplug.system.executors import given_threads, torch_threads
@@ -88,24 +83,6 @@ def compares(
     return partial(_verb, options)
 
 
-def _constant(value: Any) -> Any:
-    """The argument of a verb, without what autograd knows of Gaussians and poses."""
-    if isinstance(value, Gaussians) and any(column.requires_grad for column in value.columns.values()):
-        return replace(value, **{name: column.detach() for name, column in value.columns.items()})
-    if isinstance(value, Pyramid):
-        return value if (scene := _constant(value.scene)) is value.scene else replace(value, scene=scene)
-    if isinstance(value, Scene) and value.path is None:
-        held = value.levels or value.gaussians()
-        return value if (constant := _constant(held)) is held else Scene.in_memory(constant)
-    if isinstance(value, Camera) and value.cam_from_world.requires_grad:
-        return replace(value, cam_from_world=value.cam_from_world.detach())
-    if isinstance(value, CameraSet):
-        return replace(value, train=tuple(map(_constant, value.train)), test=tuple(map(_constant, value.test)))
-    if isinstance(value, Mapping):
-        return {name: _constant(each) for name, each in value.items()}
-    return [*map(_constant, value)] if isinstance(value, list | tuple) else value
-
-
 def _verb(options: Any, body: Callable[..., Any]) -> Any:
     *given, last = inspect.signature(body).parameters.values()
     assert last.name == "options"
@@ -119,7 +96,7 @@ def _verb(options: Any, body: Callable[..., Any]) -> Any:
         bound = inputs.bind(*args, **own)
         bound.apply_defaults()
         for name in bound.arguments.keys() & {"scene", "scenes", "cameras"}:
-            bound.arguments[name] = _constant(bound.arguments[name])
+            bound.arguments[name] = detached(bound.arguments[name])
         if isinstance(output := bound.arguments.get("output"), str | PathLike):
             check_name(output)
         # where more threads pay, and are free, `on_free_cores` takes them
