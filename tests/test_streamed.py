@@ -25,8 +25,11 @@ from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 
 LEVELS = 2
+HOW = {"levels": LEVELS, "refine": False, "min_seen": 0.0}
 SCENE = make_scene(200)
 CAMERAS = aaplug.CameraSet(tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))), ())
+UTM = torch.tensor([5e5, 4.2e6, 100.0], dtype=torch.float64)
+FAR_SCENE = replace(SCENE.to(torch.float64), means=SCENE.means + UTM)
 
 
 @pytest.fixture
@@ -36,8 +39,18 @@ def small_leaves(monkeypatch):
 
 
 def made(folder, to, **how):
-    options = {"levels": LEVELS, "refine": False, "min_seen": 0.0, **how}
-    return aaplug.lod(SCENE, CAMERAS, folder, to=to, **options)
+    return aaplug.lod(SCENE, CAMERAS, folder, to=to, **HOW | how)
+
+
+def moved(cameras, by):
+    """The cameras in the place of a scene that was moved."""
+
+    def placed(camera):
+        pose = camera.cam_from_world.double().clone()
+        pose[:3, 3] -= pose[:3, :3] @ by
+        return replace(camera, cam_from_world=pose)
+
+    return replace(cameras, train=tuple(map(placed, cameras.train)))
 
 
 def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
@@ -73,13 +86,17 @@ def test_a_complete_stream_is_refused_and_complete_only_for_as_many_levels(tmp_p
             made(tmp_path / "out", to, **how)
 
 
-def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves):
+@pytest.mark.parametrize("far", [False, True])
+def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves, far):
     """By the specification: an error over distance in px, and a child's box and error within its parent's."""
-    made(tmp_path / "out", "3dtiles")
+    whole = FAR_SCENE if far else SCENE
+    levels = aaplug.lod(whole, moved(CAMERAS, UTM * far), tmp_path / "out", to="3dtiles", **HOW)
     index = json.loads((tmp_path / "out" / "tileset.json").read_text())
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert (index["asset"]["version"], required) == ("1.1", streamed.SPLATS)
-    assert index["root"]["transform"] == torch.eye(4).flatten().tolist()
+    transform = torch.tensor(index["root"]["transform"], dtype=torch.float64).view(4, 4).T
+    assert torch.equal(transform[:3, :3], torch.eye(3, dtype=torch.float64))
+    assert far or index["root"]["transform"] == torch.eye(4).flatten().tolist()
     rates = median_rates(SCENE.means, CAMERAS.train)
     rate, counts = float(rates[rates > 0].median()), [0] * (LEVELS + 1)
     for tile in index["root"]["children"]:
@@ -88,7 +105,11 @@ def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves
             scene = read_scene(tmp_path / "out" / tile["content"]["uri"]).gaussians()
             counts[level] += len(scene)
             middle, half = torch.tensor(tile["boundingVolume"]["box"]).split([3, 9])
-            inside = -scene.means[:, [0, 2, 1]] - middle
+            local = -scene.means[:, [0, 2, 1]]
+            inside = local - middle
+            placed = -(local + transform[:3, 3])[:, [0, 2, 1]]
+            errors = (placed[:, None] - levels[level].scene.means).abs().amax(dim=2)
+            assert errors.amin(dim=1).max() < 1e-5
             assert (inside.abs() <= half.reshape(3, 3).diagonal() + 1e-3).all()
             assert (tile["refine"], "transform" in tile) == ("REPLACE", False)
             expected = MAX_SCREEN_ERROR / (TILE_SWITCH * rate * 0.5**level) if level else 0.0
@@ -97,6 +118,26 @@ def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves
             level -= 1
         assert level == -1
     assert counts == index["asset"]["extras"]["counts"]
+
+
+@pytest.mark.parametrize(("to", "viewer"), [("sog", "playcanvas"), ("rad", "spark")])
+def test_a_viewer_without_transforms_is_told_to_move_far_gaussians(tmp_path, caplog, to, viewer):
+    streamed.check_positions(tmp_path, to, replace(SCENE, log_scales=SCENE.log_scales - 20))
+    made(tmp_path / "near", to)
+    assert not caplog.messages, "moving would not help"
+    aaplug.lod(FAR_SCENE, moved(CAMERAS, UTM), tmp_path / "far", to=to, **HOW)
+    assert caplog.messages[0].startswith(f"{tmp_path / 'far'}: {viewer} moves ")
+    assert caplog.messages[0].endswith(
+        " of 200 Gaussians by more than their size, so far from the origin; "
+        "move the scene by aaplug merge, or write 3dtiles"
+    )
+
+
+def test_3d_tiles_refuse_what_lies_too_far_apart_before_anything_is_written(tmp_path):
+    apart = replace(SCENE, means=SCENE.means.index_fill(0, torch.tensor(7), 5e6))
+    with pytest.raises(OutputError, match=r"out: 3D Tiles cannot hold a position 5e\+06 units from the scene's middle"):
+        aaplug.lod(apart, CAMERAS, tmp_path / "out", to="3dtiles", **HOW)
+    assert not list(tmp_path.iterdir())
 
 
 def read_rad(path):

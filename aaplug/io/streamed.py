@@ -9,6 +9,7 @@ Spark's .rad is one file of all levels, in which each Gaussian is exchanged for 
 """
 
 import json
+import logging
 import math
 import re
 import shutil
@@ -32,11 +33,12 @@ from aaplug.core.pyramids import Level
 from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing, write_file
 from aaplug.io.rad import MAX_NODE_SIZE, rad_of, tree_of
-from aaplug.io.scenes import gltf, read_scene, write_scene
+from aaplug.io.scenes import gltf, read_scene, spz, write_scene
 from aaplug.io.scenes.pyramid_folder import MAX_GAUSSIANS
+from aaplug.io.scenes.record import MOVED_SHARE
 from aaplug.io.scenes.rows import library_errors
 from aaplug.io.values import Place, natural, numbers, object_of, read_json
-from aaplug.system.errors import FormatError, OutputError, UsageError, reason
+from aaplug.system.errors import FormatError, OutputError, UsageError, counted, reason
 from aaplug.system.executors import Threads, given_threads
 
 LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
@@ -44,8 +46,11 @@ SWITCH = 1.5  # rate at which a viewer should change level, as a multiple of the
 TILE_SWITCH = 2.0  # the same of a tile, whose box holds the Gaussians' extents and so begins nearer than they do
 PLAYCANVAS_TANGENT = math.tan(math.radians(22.5))  # of half the field of view that its distances are meant for
 UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again when the camera moved so far
+FAR = 16.0  # from here on a scene is far from the origin: its middle's distance over that of its Gaussians from there
+ROUNDING = {"sog": 2.0**-20, "rad": 2.0**-11}  # of a position, relative: PlayCanvas's 32-bit exp, Spark's 16-bit floats
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
 ALWAYS = 1e6  # error of the root over that of the coarsest level, so that something is drawn at any distance
+TILE_AXES = [0, 2, 1]  # a scene's (x, y, z) is (-x, -y, z) in glTF and (-x, -z, -y) in a tile, whose z is up
 SPLATS = [gltf.SPLATS, gltf.SPZ]
 CESIUM = tuple(f"cesium/Build/Cesium/{name}" for name in ("Cesium.js", "Assets", "ThirdParty", "Workers"))
 SPARK = "@sparkjsdev/spark/dist/spark.module.min.js"
@@ -57,10 +62,13 @@ THREE = (
 TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
 SETTINGS, PAGE = "settings.json", "index.html"
 PAGE_SCRIPTS = ("orbit.js", "problems.js")
+Middle = Float[Tensor, " 3"]  # in float64
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 FACTS = 7  # numbers that tell of a part: its Gaussians, and the smallest and largest coordinates
 MAKE_AGAIN = "`aaplug lod --overwrite` makes all levels again"
 NOTHING = [0.0, *[math.inf] * 3, *[-math.inf] * 3]  # of an empty part
+
+log = logging.getLogger("aaplug")
 
 
 @dataclass(frozen=True)
@@ -116,12 +124,37 @@ def leaves_of(finest: Level) -> Int[Tensor, " chunks"]:
     return (torch.bincount(finest.chunks).cumsum(0) - 1) // LEAF_GAUSSIANS
 
 
-def parts_of(level: Level, leaves: Int[Tensor, " chunks"]) -> Iterator[Gaussians]:
-    """A level's Gaussians by part of space."""
+def middle_of(scene: Gaussians, name: StreamName) -> Middle:
+    """What positions in a stream's files are relative to: `_far_middle` in 3D Tiles, whose index moves them back."""
+    return _far_middle(scene) if name == "3dtiles" else torch.zeros(3, dtype=torch.float64)
+
+
+def _far_middle(scene: Gaussians) -> Middle:
+    """The middle of a scene far from the origin; 0 near it."""
+    means = scene.means.double()
+    middle = means.median(dim=0).values
+    return middle * (middle.abs().max() > FAR * (means - middle).abs().median())
+
+
+def check_positions(path: Path, name: StreamName, scene: Gaussians) -> None:
+    """Raise OutputError if a stream cannot hold the scene's positions; warn if its viewer moves them for being far."""
+    distances = (scene.means.double() - middle_of(scene, name)).abs().amax(dim=1)
+    if name == "3dtiles" and (farthest := float(distances.max())) >= spz.REACH:
+        where = f"a position {farthest:g} units from the scene's middle, only below {spz.REACH:,.0f}"
+        raise OutputError(path, f"3D Tiles cannot hold {where}; scale the scene by aaplug merge")
+    moved = int((distances * ROUNDING.get(name, 0.0) > scene.scales.amax(dim=1)).sum())
+    if moved > MOVED_SHARE * len(scene) and _far_middle(scene).any():
+        what = f"moves {moved:,} of {counted(len(scene), 'Gaussian')} by more than their size, so far from the origin"
+        log.warning("%s: %s %s; move the scene by aaplug merge, or write 3dtiles", path, STREAMS[name].viewer, what)
+
+
+def parts_of(level: Level, leaves: Int[Tensor, " chunks"], middle: Middle) -> Iterator[Gaussians]:
+    """A level's Gaussians by part of space, their positions relative to `middle`."""
     assert level.chunks is not None
     owners = leaves[level.chunks]
     for leaf in range(int(leaves.max()) + 1):
-        yield level.scene[(owners == leaf).nonzero().squeeze(1)]
+        part = level.scene[(owners == leaf).nonzero().squeeze(1)]
+        yield replace(part, means=(part.means.double() - middle).to(part.means.dtype))
 
 
 def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gaussians]) -> None:
@@ -204,12 +237,14 @@ def write_index(
     frame: Frame,
     compensated: bool = True,
     tree: Front | None = None,
+    middle: Middle | None = None,
 ) -> Mapping[str, Any]:
     """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
     rate: of training, in px per world unit.  frame: what a page shows first.
     compensated: levels are for a rule with compensation.
     tree: of a .rad.
+    middle: what the parts are relative to; see `middle_of`.
     """
     stream = STREAMS[name]
     if tree is not None:
@@ -221,6 +256,8 @@ def write_index(
             raise FormatError(folder, f"every level should have the same number of parts; {listed}; {MAKE_AGAIN}")
         parts = torch.tensor(facts, dtype=torch.float64)
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
+        if middle is not None and name == "3dtiles":
+            index["root"]["transform"][12:15] = (0.0 - middle[TILE_AXES]).tolist()  # no -0.0
         content = _json(index)
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
@@ -359,6 +396,6 @@ def _bound(box: Box) -> dict[str, list[float]]:
 
 
 def _volume(box: Box) -> dict[str, list[float]]:
-    """A tile's box.  Its axes are z up: a scene's (x, y, z) is (-x, -y, z) in glTF and (-x, -z, -y) in a tile."""
-    middle, half = -box.mean(dim=0)[[0, 2, 1]], ((box[1] - box[0]) / 2)[[0, 2, 1]]
+    """A tile's box, in its axes."""
+    middle, half = -box.mean(dim=0)[TILE_AXES], ((box[1] - box[0]) / 2)[TILE_AXES]
     return {"box": [*middle.tolist(), *torch.diag(half).flatten().tolist()]}

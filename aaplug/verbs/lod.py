@@ -76,6 +76,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     whole = fuse_stored(job.scene.gaussians())
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
+    if path is not None and options.to is not None:
+        streamed.check_positions(path, options.to, whole)
     if not job.cameras.assumed:
         check_frame(whole.means, job.cameras.train, whole.name, options.min_seen)
     job.say_assumed()
@@ -263,7 +265,8 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
             if options.to is None:
                 kept = level
             elif folder is not None:
-                streamed.write_level(folder, options.to, place, streamed.parts_of(level, leaves))
+                parts = streamed.parts_of(level, leaves, streamed.middle_of(maker.scene, options.to))
+                streamed.write_level(folder, options.to, place, parts)
         if folder is not None and not resumed:
             write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
@@ -299,7 +302,8 @@ def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]
             tree = tree._replace(scene=refine_tree(tree.scene, tree.parents, *how))
     if options.page is not None:  # before the index, which says that all is there
         streamed.write_page(folder, to, Path(options.page))
-    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree)
+    middle = streamed.middle_of(maker.scene, to)
+    settings = streamed.write_index(folder, to, len(levels), rate, frame, compensated, tree, middle)
     maker.job.monitor.say(f"set the viewer by {folder / streamed.SETTINGS}: {json.dumps(settings)}")
     streamed.remove_parts(earlier - streamed.part_folders(folder, to), to)
     if to == "rad":

@@ -55,6 +55,7 @@ MAGNITUDE_MASK = 511  # 9 bits of a quaternion's component; the tenth is its sig
 MAX_OLD_GAUSSIANS, MAX_OLD_DEGREE = 10_000_000, 3  # accepted by readers of versions before 4 (nianticlabs/spz)
 MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
+REACH = 2.0 ** (POSITION_BITS - 1)  # world units, below which positions lie, for at least one bit of fraction
 # a quaternion times 1, i, j or k, by the component that is then w: the same Gaussian, turned by halves about its axes
 HALF_TURNED = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 HALF_TURN_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
@@ -268,7 +269,7 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
         raise OutputError(path, f"readers take {MAX_OLD_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
     farthest = max(float(part.means.abs().max()) if len(part) else 0.0 for part in scenes)
     fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
-    if fraction < 1:
+    if farthest >= REACH:
         where = f"positions as far as {farthest:g} from the origin"
         raise OutputError(path, f"cannot hold {where}; move the scene by aaplug merge, or write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
