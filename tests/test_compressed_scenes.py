@@ -506,6 +506,17 @@ def test_a_checkpoint_is_what_the_cfg_of_its_run_says(tmp_path: Path, stated, co
     assert ("cfg.yml of its run says" in opened.evidence) == (stated != "[]")
 
 
+@pytest.mark.parametrize("kind", ["2dgs", "2dgs-inria"])
+def test_a_checkpoint_of_gsplats_2dgs_trainer_holds_discs(tmp_path: Path, kind):
+    (tmp_path / "cfg.json").write_text(f'{{"antialiased": false, "model_type": "{kind}"}}')
+    (tmp_path / "ckpts").mkdir()
+    opened = read_scene(write_file(tmp_path / "ckpts", "run.pt"), allow_checkpoint=True)
+    assert opened.evidence == "cfg.json of its run says 2D Gaussians (2DGS), treated as classic"
+    discs, stored = opened.gaussians(), splats()["scales"]
+    assert discs.flat
+    assert discs.log_scales.equal(torch.cat([stored[:, :2], torch.full((40, 1), -MAX_LOG_SCALE)], dim=1))
+
+
 class Trap:
     def __reduce__(self):
         return Path.touch, (Path("trap"),)

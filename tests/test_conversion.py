@@ -18,7 +18,7 @@ from aaplug.methods.conversion import FITTED_VARIANCE, FORMS, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.presets import recipe_of
-from aaplug.methods.viewers import VIEWERS
+from aaplug.methods.viewers import DISC_VIEWER, VIEWERS
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
@@ -145,3 +145,4 @@ def test_discs_are_smoothed_within_their_planes_and_stay_discs(cameras, tmp_path
 
 def test_a_format_that_no_viewer_opens_is_told():
     assert VIEWERS["mip"].advice("balls", "scene.balls") == "no viewer is known to open scene.balls"
+    assert DISC_VIEWER.advice("sog", "discs.sog") == "no viewer is known to open discs.sog"  # as discs

@@ -105,7 +105,7 @@ class Viewer:
             if alike:
                 return f"open {file} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
             fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
-            if not fitting:
+            if not fitting or self == DISC_VIEWER:  # the others show no discs
                 return f"no viewer is known to open {file}"
             hint = f"--for {listing(fitting)} writes one for its own rule"
             if others:

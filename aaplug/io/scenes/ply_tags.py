@@ -7,7 +7,7 @@ Sources, strongest first:
     comment SplatRenderMode: mip | antialiased | default                Brush, splat-transform
     comment antialiased 1 | 0                                           Postshot
     tables of a camera                                                  SHARP, whose renderer adds nothing
-    the configuration of the run                                        nerfstudio, gsplat
+    the configuration of the run                                        nerfstudio, gsplat (and its trainer of 2DGS)
 Of several comments of a kind the last one counts.  Viewers know only SplatRenderMode; aaplug's record tells a kernel of
 0.1 px² from one of 0.3 px².  Other programs drop the record: see `KERNEL_LOST`.
 
@@ -41,6 +41,7 @@ KEY = re.compile(r"[!-<>-~]+")  # the same without "="
 
 NERFSTUDIO_CONFIG, NERFSTUDIO_LINE = "config.yml", re.compile(rb"^[ \t]*rasterize_mode:[ \t]*(\w+)[ \t]*\r?$", re.M)
 GSPLAT_CONFIG, GSPLAT_LINE = "cfg.yml", re.compile(rb"^antialiased:[ \t]*(\w+)[ \t]*\r?$", re.M)
+GSPLAT_DISCS, DISCS_LINE = "cfg.json", re.compile(rb'"model_type":[ \t]*"2dgs')  # "2dgs" and "2dgs-inria"
 GSPLAT_FOLDERS = ("ply", "ckpts")  # of a run, with what its trainer exports
 RUN_MODES = {b"antialiased": ANTIALIASED, b"true": ANTIALIASED, b"classic": CLASSIC, b"false": CLASSIC}
 # Brush, which introduced the tag, blurs by 0.1 px² for "mip"; "antialiased" is gsplat's word for 0.3 px².
@@ -143,12 +144,13 @@ def _fused_line(fusion: Fusion, convention: Convention) -> str:
 
 
 def run_config(scene: Path, nerfstudio: bool = False) -> Facts | None:
-    """The convention in the configuration of the run that holds the scene, and the evidence; None if it has none.
+    """What the configuration of the run that holds the scene says of it, and the evidence; None if it has none.
 
     nerfstudio's exporter and gsplat's trainer write no tag, but their runs keep a YAML file: nerfstudio's config.yml
     has a line `rasterize_mode: classic` or `antialiased`; gsplat's cfg.yml, in the folder above ply/ and ckpts/, has
-    `antialiased: true` or `false`.  Such a file may hold Python objects, so it is never loaded as YAML: one line is
-    sought in its first HEAD_LIMIT bytes.
+    `antialiased: true` or `false`.  gsplat's trainer of 2D Gaussians, which leaves their third scale as it began, has
+    a cfg.json above ckpts/ with `"model_type": "2dgs"`.  A YAML file may hold Python objects, so none is ever loaded:
+    one line is sought in its first HEAD_LIMIT bytes.
     """
     folder = scene.absolute().parent
     config, line = folder / NERFSTUDIO_CONFIG, NERFSTUDIO_LINE
@@ -156,9 +158,16 @@ def run_config(scene: Path, nerfstudio: bool = False) -> Facts | None:
         config, line = folder.parent / GSPLAT_CONFIG, GSPLAT_LINE
         if folder.name not in GSPLAT_FOLDERS:
             return None
-    try:
-        values = {value.lower() for value in line.findall(read_start(config, HEAD_LIMIT))}
-    except FormatError:  # it is not there, or cannot be read
-        return None
+        if folder.name == "ckpts" and DISCS_LINE.search(_start_of(folder.parent / GSPLAT_DISCS)):
+            return Facts(f"{GSPLAT_DISCS} of its run says 2D Gaussians (2DGS), treated as classic", flat=True)
+    values = {value.lower() for value in line.findall(_start_of(config))}
     convention = RUN_MODES.get(values.pop()) if len(values) == 1 else None  # the one value that all such lines have
     return None if convention is None else Facts(f"{config.name} of its run says {convention.name}", convention)
+
+
+def _start_of(config: Path) -> bytes:
+    """The first HEAD_LIMIT bytes; none if the file is not there, or cannot be read."""
+    try:
+        return read_start(config, HEAD_LIMIT)
+    except FormatError:
+        return b""

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.ply_tags import run_config
@@ -28,7 +28,7 @@ from aaplug.system.errors import FormatError
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
-UNKNOWN = Facts("neither the format nor a cfg.yml in the folder above says: assumed classic")
+UNKNOWN = Facts("neither the format nor a cfg.yml or cfg.json in the folder above says: assumed classic")
 
 name = "pt"
 
@@ -61,8 +61,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         except pickle.UnpicklingError as error:  # torch's own words advise loading everything else too
             raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
         splats = _splats(path, document, size)
-    count, degree = len(splats["means"]), DEGREES[3 * splats["shN"].shape[1]]
-    return Scene(path, name, count, degree, partial(_rows, splats), *(run_config(path) or UNKNOWN))
+    count, degree, said = len(splats["means"]), DEGREES[3 * splats["shN"].shape[1]], run_config(path) or UNKNOWN
+    return Scene(path, name, count, degree, partial(_rows, splats, said.flat), *said)
 
 
 def _splats(path: Path, document: Any, size: int) -> dict[str, Tensor]:
@@ -89,7 +89,9 @@ def _splats(path: Path, document: Any, size: int) -> dict[str, Tensor]:
     return tensors
 
 
-def _rows(tensors: dict[str, Tensor], start: int, stop: int) -> Gaussians:
+def _rows(tensors: dict[str, Tensor], flat: bool, start: int, stop: int) -> Gaussians:
     parts = {key: tensor[start:stop].detach().float().clone() for key, tensor in tensors.items()}
     means, quats, scales, opacities = (parts[key] for key in ("means", "quats", "scales", "opacities"))
+    if flat:
+        scales[:, 2] = -MAX_LOG_SCALE
     return Gaussians(means, quats, scales, opacities, torch.cat([parts["sh0"], parts["shN"]], dim=1))
