@@ -37,6 +37,8 @@ def test_each_frame_is_drawn_as_its_file_alone_at_the_training_size(folder):
         assert renderer.passes(replace(FAR, frame=k), ["depth"])["depth"].equal(alone.passes(FAR, ["depth"])["depth"])
     with pytest.raises(UsageError, match="expected one of 0 to 2, got 3"):
         renderer(replace(FAR, frame=3))
+    with pytest.raises(UsageError, match="frame: expected an integer from 0, got -1"):
+        renderer.at(-1)
 
 
 def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):

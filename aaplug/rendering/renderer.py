@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from os import PathLike
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -49,7 +49,7 @@ from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import CHANNELS, channels_at_once, find_rasterizer, kernels_of
 from aaplug.rendering.passes import by_order, composited, expected
-from aaplug.system.contracts import check_fields, contract
+from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of, within_memory
 from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
@@ -187,7 +187,7 @@ class Renderer:
         return same
 
     @contract
-    def at(self, frame: int) -> "Renderer":
+    def at(self, frame: Annotated[int, Range(0)]) -> "Renderer":
         """The renderer of one frame of a scene in time, by its place from 0; itself for any other scene.
 
         Raises:
