@@ -41,6 +41,17 @@ def test_each_frame_is_drawn_as_its_file_alone_at_the_training_size(folder):
         renderer.at(-1)
 
 
+def test_threads_may_ask_for_different_frames(folder):
+    class Shared(dict):
+        def __setitem__(self, frame, renderer):
+            super().__setitem__(frame, renderer)
+            self.clear()  # by another thread, which opens its own
+
+    renderer = Renderer.of(folder, CAMERAS, "auto", rasterizer="eager")
+    object.__setattr__(renderer, "_open", Shared())
+    assert len(renderer.at(1).scene) == 40
+
+
 def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):
     together, apart = (
         Renderer.of(read_scene(folder, frames_apart=flag), CAMERAS, "mip-splatting", rasterizer="eager")

@@ -197,14 +197,15 @@ class Renderer:
             return self
         if frame >= len(self.in_time):
             raise UsageError("frame", f"expected one of 0 to {len(self.in_time) - 1}, got {frame}")
-        if frame not in self._open:
+        now = self._open.get(frame)
+        if now is None:
             self._open.clear()
             gaussians, harmonics = without_harmonics(self.in_time.open(self.in_time.paths[frame]))
             training = self.in_time.training_of(gaussians, self.training)
             scene = self.recipe.prepared(gaussians, training)
             now = replace(self, scene=scene, training=training, harmonics=harmonics, source=None, in_time=None)
-            self._open[frame] = now
-        return self._open[frame]
+            self._open[frame] = now  # which another thread may clear
+        return now
 
     @contract
     @on_free_cores()
