@@ -95,9 +95,11 @@ def convert(words: Words) -> Answer:
     from aaplug.io.scenes import written_format
     from aaplug.methods.conversion import described_fusions
 
-    how = "part by part" if result.scene is None else f"fused {described_fusions(result.scene.fused)}"
-    say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     format = written_format(words.output)  # None for a folder of frames, which are .ply
+    how = "frame by frame" if format is None else "part by part"
+    if result.scene is not None:
+        how = f"fused {described_fusions(result.scene.fused)}"
+    say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     kind = "ply" if format is None else getattr(format, "read_as", None) or format.name
     say(result.viewer.advice(kind, words.output.name))
     title = "As the viewer draws it, against the scene's own training-size render:"

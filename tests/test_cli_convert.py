@@ -51,6 +51,13 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
     torch.testing.assert_close(found.log_scales, expected)
 
 
+def test_convert_of_a_scene_in_time_is_frame_by_frame(cli):
+    for number in (1, 2):
+        write_scene(Path(f"frames/{number}.ply"), make_scene(20))
+    _, err = cli.done("convert frames --cameras . -o converted --min-seen 0")
+    assert "wrote converted: frame by frame; show it with 0.1 px², compensated (mip)" in err
+
+
 @pytest.mark.parametrize(("viewer", "steps"), [("classic", "1"), ("gsplat", "16")])
 def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer, steps):
     """A viewer that draws as training did is right at the training size, and every step takes away from that."""
