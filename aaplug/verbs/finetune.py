@@ -76,7 +76,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             checkpoint (.finetune.pt) go beside it.  None writes nothing.
 
     Raises:
-        AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
+        AaplugError: as `render`; also, the scene holds 2D Gaussians, the checkpoint is of another run, or no gradient
+            is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     method = METHODS.find("learned-filters" if options.learn_filters else options.method, "method")
@@ -87,6 +88,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     if isinstance(viewer, str):
         viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
+    if job.scene.flat:
+        raise UsageError(job.scene.name, "holds 2D Gaussians, which no renderer that is tuned for draws as discs")
     checkpoint = path and _beside(path, "pt")
     resumes = options.resume and checkpoint is not None and checkpoint.exists()
     replaces = options.overwrite or resumes  # beside a checkpoint, the other files are of the same run
