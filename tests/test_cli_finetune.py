@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -14,8 +13,8 @@ from aaplug_cli.main import main
 
 from aaplug.core.conventions import MIP
 from aaplug.finetuning import loop
-from aaplug.io.scenes import read_scene, write_scene
-from tests.conftest import exit_code, made_by, make_scene
+from aaplug.io.scenes import read_scene
+from tests.conftest import exit_code, made_by
 
 TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
@@ -50,14 +49,6 @@ def test_an_upsampler_is_for_scales_above_the_photographs(cli):
     words = "finetune scene.ply --cameras . -o tuned.ply --train-scale 0.5 --upsampler bicubic --steps 0 --scale"
     cli.refused(f"{words} 2", "--upsampler: is for scales above the source images', and there is none")
     cli.done(f"{words} 4")
-
-
-def test_finetune_refuses_2d_gaussians(cli):
-    write_scene(Path("discs.ply"), replace(make_scene(9), flat=True))
-    cli.refused(
-        "finetune discs.ply --cameras . -o tuned.ply --steps 1",
-        "discs.ply: holds 2D Gaussians, which no renderer that is tuned for draws as discs",
-    )
 
 
 def test_finetune_writes_scene_report_and_pictures(whole):

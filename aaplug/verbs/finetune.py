@@ -88,8 +88,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     if isinstance(viewer, str):
         viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
-    if job.scene.flat:
-        raise UsageError(job.scene.name, "holds 2D Gaussians, which no renderer that is tuned for draws as discs")
     checkpoint = path and _beside(path, "pt")
     resumes = options.resume and checkpoint is not None and checkpoint.exists()
     replaces = options.overwrite or resumes  # beside a checkpoint, the other files are of the same run
