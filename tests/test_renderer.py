@@ -3,6 +3,7 @@
 import ast
 import copy
 import itertools
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.imaging import average_samples, box_average
 from aaplug.core.lenses import Lens
 from aaplug.core.passes import PASSES
-from aaplug.core.projection import project
+from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
@@ -82,6 +83,28 @@ def test_auto_draws_discs_for_a_scene_of_2d_gaussians_only(cameras):
     assert own_look(flat, TrainingViews.of(flat, cameras)).recipe.pixel is SURFEL
     best = suited(find_recipe("auto", quality="best"), flat)
     assert best.samples_at(0.25) == 4
+
+
+def test_a_disc_whose_centre_is_far_outside_of_the_image_is_drawn_where_rays_meet_it():
+    """2DGS intersects every ray exactly: nothing is linearised at a place that is clamped to the widened image."""
+    camera = replace(make_camera((0.0, -4.0, 0.0), (24, 18)), cam_from_world=torch.eye(4, dtype=torch.float64))
+    tilt, centre = torch.tensor(math.radians(60)), torch.tensor([2 * 12 / camera.fx * 4, 0.0, 4.0], dtype=torch.float64)
+    disc = replace(
+        make_scene(1),
+        means=centre[None].float(),
+        quats=torch.tensor([[(tilt / 2).cos(), 0.0, (tilt / 2).sin(), 0.0]]),
+        log_scales=torch.tensor([[0.0, 0.0, -30.0]]),
+        logit_opacities=torch.tensor([3.0]),
+        flat=True,
+    )
+    along, across, normal = rotation_matrices(disc.quats.double())[0].T
+    y, x = torch.meshgrid(torch.arange(18) + 0.5, torch.arange(24) + 0.5, indexing="ij")
+    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=2).double()
+    offsets = rays * (centre @ normal / (rays @ normal))[:, :, None] - centre
+    expected = torch.sigmoid(torch.tensor(3.0)) * torch.exp(-0.5 * ((offsets @ along) ** 2 + (offsets @ across) ** 2))
+    alpha = Renderer.of(disc, [camera], "2dgs", rasterizer="eager", min_seen=0.0)(camera).alpha
+    assert expected.max() > 0.05
+    torch.testing.assert_close(alpha.double(), torch.where(expected < 1 / 255, 0.0, expected), rtol=0, atol=1e-5)
 
 
 def test_cameras_of_another_scene_and_none_are_refused(cameras):
@@ -224,7 +247,9 @@ def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras
     scene = replace(scene, means=scene.means.requires_grad_())
     renderer, seen = Renderer.of(scene, cameras, rasterizer="eager"), []
     monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 33)
-    monkeypatch.setattr(rendering, "project", lambda part, *rest: seen.append(len(part)) or project(part, *rest))
+    monkeypatch.setattr(
+        rendering, "project", lambda part, *rest, **more: seen.append(len(part)) or project(part, *rest, **more)
+    )
     whole = renderer(cameras[0]).rgb
     assert seen == [200]
     with torch.no_grad():

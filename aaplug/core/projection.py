@@ -24,18 +24,24 @@ from aaplug.core.sights import sights
 from aaplug.core.splats import Splats2D, picked
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
+ANY_SLOPE = (-1e9, 1e9)  # limits that clamp nothing
 PLACES = 17  # along a side, at which it is found what a distorting pinhole sees
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
 MIN_LENGTH = 1e-12  # of a quaternion, which one of length 0 is divided by; its gradient stays finite
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 
 
-def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
-    """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
+def project(
+    scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS, clamped: bool = True
+) -> Splats2D:
+    """Splats of every Gaussian beyond the near plane, without colour and before any screen filter.
+
+    clamped: slopes are, as 3DGS does; a disc that a pinhole's rays meet exactly needs the derivative at its own centre.
+    """
     if camera.lens != PINHOLE:
         return _project_through(scene, camera, kernels, rules)
     shape = scene.means, scene.quats, scene.log_scales
-    columns = kernels.run(PROJECT, *shape, *_camera_rows(scene.means, camera, rules))
+    columns = kernels.run(PROJECT, *shape, *_camera_rows(scene.means, camera, rules, clamped))
     return _beyond(rules.near, columns, scene.opacities)
 
 
@@ -116,13 +122,13 @@ def thinnest_axes(scene: Gaussians, sources: Int[Tensor, " m"]) -> Float[Tensor,
 
 
 def _camera_rows(
-    like: Tensor, camera: Camera, rules: Rules
+    like: Tensor, camera: Camera, rules: Rules, clamped: bool = True
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 9"]]:
     """Centre (float64), rotation, and the lens.
 
     The lens: fx, fy, cx, cy, the slopes between which projection is linearised, and the near plane's depth.
     """
-    x, y = slope_limits(camera)
+    x, y = slope_limits(camera) if clamped else (ANY_SLOPE, ANY_SLOPE)
     lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y, rules.near])
     rotation = camera.cam_from_world[:3, :3].to(like)
     return camera.centre.to(like.device), rotation, lens

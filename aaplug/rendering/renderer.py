@@ -457,7 +457,7 @@ class Renderer:
         """
         recipe, training, kernels = self.recipe_through(camera), self.training, self.kernels
         rules = training.convention.rules
-        splats = project(chunk, camera, kernels, rules)
+        splats = project(chunk, camera, kernels, rules, clamped=not recipe.pixel.needs_depth_slopes)
         if recipe.selection is not None:
             splats = asked("selection", recipe.selection, "__call__", splats, chunk)
         if recipe.pixel.needs_depth_slopes:
