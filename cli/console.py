@@ -49,13 +49,13 @@ def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
     Widths are those of CSS's automatic table layout.
     """
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     grid = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
     rows = list(rows)
     for row in rows:
-        grid.add_row(*map(escape, row))
+        grid.add_row(*(Text("\n".join(map(printable, cell.split("\n")))) for cell in row))
     columns = [[*cells] for cells in zip(*([headings] if headings else []), *rows, strict=True)]
     least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]
     most = [max(map(len, "\n".join(cells).split("\n"))) for cells in columns]
@@ -77,16 +77,16 @@ def quiet() -> Iterator[None]:
         log().quiet = before
 
 
-def _print(text: str, heading: str = "") -> None:
-    """One line of log, without control characters; heading: its first word, with markup."""
-    from rich.markup import escape
+def _print(text: str, heading: str = "", style: str = "") -> None:
+    """One line of log as it is, but for control characters; heading: its first word, in a style."""
+    from rich.text import Text
 
-    log().print(f"{heading}{escape(printable(text))}")
+    log().print(Text.assemble((heading, style), printable(text)))
 
 
 class _Warnings(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        _print(record.getMessage(), "[yellow]warning:[/] ")
+        _print(record.getMessage(), "warning: ", "yellow")
 
 
 def set_up() -> None:
@@ -103,7 +103,7 @@ def set_up() -> None:
 
 def refuse(problem: str) -> None:
     """One line of error."""
-    _print(problem, "[red]error:[/] ")
+    _print(problem, "error: ", "red")
 
 
 class Terminal(Monitor):
@@ -128,9 +128,10 @@ class Terminal(Monitor):
             return
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+        named = TextColumn("{task.fields[what]}", markup=False)  # a name may look like markup, or like a field
+        columns = (named, BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
         with Progress(*columns, TimeRemainingColumn(), console=log(), transient=True) as bar:
-            task, rate = bar.add_task(unit, total=None), _Rate()
+            task, rate = bar.add_task(unit, total=None, what=printable(what)), _Rate()
 
             def tell(done: int, total: int) -> None:
                 bar.update(task, completed=done, total=total, description=f"{unit}{rate(done)}{self._workers}")

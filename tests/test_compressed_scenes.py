@@ -1,10 +1,12 @@
 """All scene formats: laws over the registry, and each against the scene that it was made of, within its steps."""
 
+import base64
 import io
 import json
 import re
 import struct
 import zipfile
+from collections import Counter
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +17,7 @@ import torch
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
 from aaplug.core.spherical_harmonics import sh_colour
+from aaplug.io.gltf import Gltf, glb_start
 from aaplug.io.scenes import (
     HEAD_BYTES,
     OWN,
@@ -27,6 +30,7 @@ from aaplug.io.scenes import (
     usd,
     write_scene,
 )
+from aaplug.io.scenes import gltf as scene_gltf
 from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.spz import AXES, packed
@@ -566,6 +570,34 @@ def test_a_checkpoint_needs_the_users_word_and_a_safe_torch(tmp_path: Path, monk
     monkeypatch.setattr(torch, "__version__", "2.9.1")
     with pytest.raises(FormatError, match=r"needs torch 2\.10"):
         read_scene(path, allow_checkpoint=True).gaussians()
+
+
+def test_time_and_memory_for_gltf_grow_with_the_file_alone(tmp_path: Path, monkeypatch):
+    calls = Counter[str]()
+
+    def counting(home, name):
+        function = getattr(home, name)
+        monkeypatch.setattr(home, name, lambda *args, **kw: calls.update([name]) or function(*args, **kw))
+
+    counting(base64, "b64decode")
+    counting(scene_gltf, "at_rest")
+    counting(scene_gltf.spz, "parsed")
+    write_scene(tmp_path / "a.gltf", make_scene(30))
+    document = json.loads((tmp_path / "a.gltf").read_text())
+    data = base64.b64encode((tmp_path / document["buffers"][0]["uri"]).read_bytes()).decode()
+    document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    document["nodes"] = [{"mesh": 0, "children": [i + 1]} for i in range(20)] + [{"mesh": 0}]
+    assert read_scene(write_json(tmp_path / "a.gltf", document)).count == 21 * 30
+    assert calls == {"b64decode": 1, "at_rest": 21}
+    write_scene(tmp_path / "a.spz.glb", make_scene(30))
+    whole = Gltf(tmp_path / "a.spz.glb")
+    nodes = {**whole.root.fields, "nodes": [{"mesh": 0}] * 20}
+    blob = whole.binary.read(0, whole.binary.size)
+    (tmp_path / "a.spz.glb").write_bytes(glb_start(nodes, len(blob)) + blob)
+    monkeypatch.setenv("AAPLUG_GAUSSIANS", "100")
+    with pytest.raises(FormatError, match="holds 120 Gaussians and the limit is 100"):
+        read_scene(tmp_path / "a.spz.glb")
+    assert calls["parsed"] == 4
 
 
 def test_bytes_of_an_opaque_gaussian_stay_finite(tmp_path: Path):

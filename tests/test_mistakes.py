@@ -5,17 +5,21 @@ import os
 import re
 import sys
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from aaplug_cli.console import TERMINAL
+from aaplug_cli import console
+from aaplug_cli.console import TERMINAL, refuse, table
 from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
+from rich.console import Console
 
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.system.errors import FormatError
+from aaplug.system.errors import FormatError, printable
+from aaplug.verbs.batch import status_table
 from tests.conftest import exit_code, make_scene
 
 LONG = "n" * 300
@@ -127,6 +131,23 @@ def test_a_principal_point_far_away_is_refused(tmp_path):
     (folder / "images.txt").write_text("1 1 0 0 0 0 0 4 1 a.png\n\n")
     with pytest.raises(FormatError, match=r"camera a\.png: cx: expected a number from -1e"):
         read_cameras(tmp_path)
+
+
+NAMES = ("{x}", "[/x]", "[red]x", ":bomb:", "x\\", "{task.fields}", "a\x1b[31m")  # fields, markup, an emoji, commands
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_no_markup_field_or_command_of_the_terminal(monkeypatch, name):
+    written = StringIO()
+    terminal = Console(file=written, force_terminal=True, color_system=None, width=100)
+    monkeypatch.setattr(console, "log", lambda: terminal)
+    with TERMINAL.progress(f"evaluating {name}", "views") as tell:
+        tell(1, 2)
+    refuse(f"scene {name}")
+    terminal.print(table([[f"row {name}"]]), status_table("why", [(f"cell {name}", "done", "")]))
+    shown = [part + printable(name) for part in ("evaluating ", "error: scene ", "row ", "cell ")]
+    assert [part for part in shown if not re.search(re.escape(part) + r"(?!\\)", written.getvalue())] == []
+    assert "\x1b[31m" not in written.getvalue()
 
 
 def test_a_rate_of_progress_is_in_plain_digits(capsys):

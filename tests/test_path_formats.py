@@ -316,6 +316,20 @@ WRONG = {
 }  # fmt: skip
 
 
+def test_numbers_of_gltf_that_many_channels_share_have_a_limit_in_all(tmp_path, monkeypatch):
+    document = gltf(binary(), "path.bin")
+    document["nodes"] += [{}] * 40
+    document["animations"][0]["channels"] += [
+        {"sampler": 0, "target": {"node": node, "path": "translation"}} for node in range(2, 42)
+    ]
+    (tmp_path / "path.bin").write_bytes(binary())
+    file = written(tmp_path, "path.gltf", document)
+    assert len(read_camera_path(file).cameras) == 21
+    monkeypatch.setenv("AAPLUG_JSON", str(max(8000, file.stat().st_size)))
+    with pytest.raises(FormatError, match="count should be at most 2,000 numbers in all"):
+        read_camera_path(file)
+
+
 @pytest.mark.parametrize("case", WRONG)
 def test_a_broken_path_is_refused(tmp_path, case):
     name, *changed = WRONG[case]

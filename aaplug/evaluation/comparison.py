@@ -21,7 +21,6 @@ import torch
 from jaxtyping import Float, Int
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -29,10 +28,10 @@ from torch import Tensor
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.evaluation.alignment import PAIR_DISTANCE, mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
-from aaplug.evaluation.results import Facts, Report, mean, spread_of, tables
+from aaplug.evaluation.results import Facts, Report, literal, mean, spread_of, tables
 from aaplug.io.scenes.faults import usable
 from aaplug.io.scenes.scene import Scene
-from aaplug.system.errors import FrameError, printable
+from aaplug.system.errors import FrameError
 
 GUARDED = (
     "the lowest, over later scenes and scales, of the mean PSNR of views whose images differ, in dB; null if none do"
@@ -253,9 +252,9 @@ class Comparison:
                 table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
                 names, *lines = zip(headings, *rows[first : first + across], strict=True)  # scenes side by side
                 for place, name in enumerate(names):
-                    table.add_column(escape(printable(name)), justify="right" if place else "left", overflow="fold")
+                    table.add_column(literal(name), justify="right" if place else "left", overflow="fold")
                 for row in lines:
-                    table.add_row(*(escape(printable(cell)) for cell in row))
+                    table.add_row(*map(literal, row))
                 facts.append(table)
         return [*facts, *tables(self.report)]
 

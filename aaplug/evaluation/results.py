@@ -12,11 +12,12 @@ from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import EQUAL, PSNR, SSIM
-from aaplug.system.errors import counted
+from aaplug.system.errors import counted, printable
 from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
@@ -188,6 +189,11 @@ def elided(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 1 - tail]}…{text[len(text) - tail :]}"
 
 
+def literal(text: str) -> Text:
+    """A name as a cell of a table: it is no markup, nor the code of an emoji, and commands no terminal."""
+    return Text(printable(text))
+
+
 def scale_name(scale: float) -> str:
     """A scale in words: 1/4, 1, 2×, 0.3."""
     if scale > 1:
@@ -250,7 +256,7 @@ def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
     for recipe, cells in zip(report.recipes, lines, strict=True):
-        grid.add_row(escape(recipe), *cells, style=ceiling if recipe == CEILING else None)
+        grid.add_row(literal(recipe), *cells, style=ceiling if recipe == CEILING else None)
     return grid
 
 

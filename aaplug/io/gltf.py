@@ -10,6 +10,7 @@ import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -34,7 +35,7 @@ SHORTEST_TURN = 1e-6  # a shorter quaternion counts as no rotation
 
 @dataclass(frozen=True)
 class Buffer:
-    """Bytes in memory, or a stretch of a file."""
+    """A stretch of a file, or of bytes in memory."""
 
     path: Path
     size: int
@@ -43,8 +44,8 @@ class Buffer:
 
     def read(self, start: int, size: int) -> bytes:
         """`size` bytes from `start`, which lie in the buffer."""
-        held = self.held
-        return read_part(self.path, self.start + start, size) if held is None else held[start : start + size]
+        at = self.start + start
+        return read_part(self.path, at, size) if self.held is None else self.held[at : at + size]
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class Gltf:
         version = self.root.entry("asset").get("version", text)
         self.root.place.expect(version.startswith("2."), "asset.version", "2", version)
         self.files, self._lists = list[Path](), dict[str, list[Entry]]()  # files beside it, that were read
+        self._buffers, self._numbers = dict[Place, Buffer](), 0  # that were looked for; read into memory
 
     def items(self, key: str) -> list[Entry]:
         """The objects of a list of the document."""
@@ -110,11 +112,13 @@ class Gltf:
         """The bytes of the buffer view that a field names, and its entry."""
         view = self.item("bufferViews", owner, field)
         view.place.expect("extensions" not in view, "extensions", "none", view.fields.get("extensions"))
-        buffer = self._buffer(self.item("buffers", view, "buffer"))
+        entry = self.item("buffers", view, "buffer")
+        if entry.place not in self._buffers:
+            self._buffers[entry.place] = self._buffer(entry)
+        buffer = self._buffers[entry.place]
         start = natural(view.fields.get("byteOffset", 0), view.place, "byteOffset", buffer.size)
         size = natural(view.value("byteLength"), view.place, "byteLength", buffer.size - start)
-        held = None if buffer.held is None else buffer.held[start : start + size]
-        return Buffer(buffer.path, size, buffer.start + start, held), view
+        return Buffer(buffer.path, size, buffer.start + start, buffer.held), view
 
     def accessor(self, owner: Entry, field: str, kind: str, types: tuple[int, ...] = (FLOAT,)) -> Accessor:
         """The table that a field names, of this type, dense, with one of these component types."""
@@ -136,28 +140,35 @@ class Gltf:
         return Accessor(entry.place, buffer, start, stride, dtype, width, count, most)
 
     def numbers(self, owner: Entry, field: str, kind: str) -> Float[Tensor, "n c"]:
-        """The finite numbers of the accessor that a field names, all in float64; rotations may be integers."""
+        """The finite numbers of the accessor that a field names, all in float64; rotations may be integers.
+
+        Accessors may share their bytes, so that what is read from a document has a limit in all.
+        """
         found = self.accessor(owner, field, kind, tuple(TYPES) if kind == "VEC4" else (FLOAT,))
         most = whole_limit("JSON") // 4
-        found.place.expect(found.count * found.width <= most, "count", f"at most {most:,} numbers", found.count)
+        self._numbers += found.count * found.width
+        found.place.expect(self._numbers <= most, "count", f"at most {most:,} numbers in all", found.count)
         values = found.read(0, found.count)
         found.place.expect(bool(np.isfinite(values).all()), "it", "finite", "NaN or infinity")
         return torch.from_numpy(values.astype(np.float64))
 
-    def chain(self, nodes: list[Entry], index: int) -> list[int]:
-        """A node and those above it."""
-        parents = {}
+    @cached_property
+    def parents(self) -> dict[int, int | None]:
+        """The node above each node, None above a root; every node stands after the one above it."""
+        nodes, below = self.items("nodes"), dict[int | None, list[int]]()
+        parents: dict[int, int | None] = dict.fromkeys(range(len(nodes)))
         for above, node in enumerate(nodes):
             children = node.fields.get("children", [])
             node.place.expect(isinstance(children, list), "children", "a list of nodes", children)
-            for child in children:
-                parents[natural(child, node.place, "children", len(nodes) - 1)] = above
-        chain = [index]
-        while chain[-1] in parents:
-            chain.append(parents[chain[-1]])
-            if len(chain) > len(nodes):
-                raise FormatError(self.path, "its nodes lie in a circle")
-        return chain
+            parents |= {natural(child, node.place, "children", len(nodes) - 1): above for child in children}
+        for node, above in parents.items():
+            below.setdefault(above, []).append(node)
+        order = list(below.get(None, []))
+        for node in order:  # it grows meanwhile
+            order += below.get(node, [])
+        if len(order) < len(nodes):
+            raise FormatError(self.path, "its nodes lie in a circle")
+        return {node: parents[node] for node in order}
 
     def _buffer(self, buffer: Entry) -> Buffer:
         if "uri" not in buffer:

@@ -108,6 +108,8 @@ def _like(name: str, names: Sequence[str]) -> str:
 
 def printable(text: str) -> str:
     """The text with control characters, which command a terminal, in escaped form."""
+    if text.isprintable():  # at once, as long texts need
+        return text
     return "".join(c if c.isprintable() or category(c) == SPACE else repr(c)[1:-1] for c in text)
 
 

@@ -12,16 +12,17 @@ from typing import Any, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.data_sets import Paper, data_set_of, paper
 from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, remove_run, write_texts
-from aaplug.evaluation.results import Report, as_csv, method, metric_grid, results
+from aaplug.evaluation.results import Report, as_csv, literal, method, metric_grid, results
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs, writing
 from aaplug.system.contracts import contract
-from aaplug.system.errors import AaplugError, ClusterError, counted, printable, within_memory
+from aaplug.system.errors import AaplugError, ClusterError, counted, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.views import file_names
@@ -101,7 +102,7 @@ def paper_table(paper: Paper) -> Table:
     for i, heading in enumerate(paper.headings):
         table.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
     for row in paper.rows:
-        table.add_row(*(escape(cell).replace(" ±", "\n±") for cell in row))
+        table.add_row(*(Text(cell.replace(" ±", "\n±")) for cell in row))
     return table
 
 
@@ -112,7 +113,7 @@ def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:
         table.add_column(column, overflow="fold")
     for name, status, text in rows:
         status = "[red]failed[/]" if status == "failed" else status
-        table.add_row(escape(printable(name)), status, escape(printable(text)))
+        table.add_row(literal(name), status, literal(text))
     return table
 
 

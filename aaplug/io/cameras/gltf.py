@@ -42,16 +42,19 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     holders = [index for index, node in enumerate(nodes) if "camera" in node]
     if not holders:
         raise FormatError(path, "holds no camera that a node places")
-    channels = _channels(file)
-    chains = {index: file.chain(nodes, index) for index in holders}
-    moved = [index for index in holders if any(node in channels for node in chains[index])]
-    chosen = (moved or holders)[0]
-    moving = [channel for node in chains[chosen] for channel in channels.get(node, {}).values()]
+    channels, moves = _channels(file), dict[int | None, bool]()
+    for node, above in file.parents.items():
+        moves[node] = node in channels or moves.get(above, False)
+    chosen = next(filter(moves.get, holders), holders[0])
+    chain = [chosen]
+    while (above := file.parents[chain[-1]]) is not None:
+        chain.append(above)
+    moving = [channel for node in chain for channel in channels.get(node, {}).values()]
     place, fps = nodes[chosen].place, fps or max((_rate(times) for times, _, _ in moving), default=0.0) or FPS
     first, last = (pick((float(t[end]) for t, _, _ in moving), default=0.0) for pick, end in ((min, 0), (max, -1)))
     at = frame_times(first, last, fps, place)
     motions = torch.eye(4, dtype=torch.float64).expand(len(at), 4, 4)
-    for node in chains[chosen]:
+    for node in chain:
         motions = _local(nodes[node], channels.get(node, {}), at) @ motions
     axes = motions[:, :3, :3] / motions[:, :3, :3].norm(dim=1, keepdim=True)
     rows = zip(axes * OPENCV_FROM_OPENGL, motions[:, :3, 3], strict=True)

@@ -30,7 +30,7 @@ from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, logit_of, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.rows import SceneFileOptions, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry
 from aaplug.system.errors import FormatError, OutputError
@@ -133,14 +133,13 @@ class Primitive:
 
 
 def _primitives(document: Gltf) -> list[Primitive]:
-    nodes, found = document.items("nodes"), list[Primitive]()
+    nodes, found, count = document.items("nodes"), list[Primitive](), 0
+    motions = dict[int, Float[Tensor, "4 4"]]()
+    for index, above in document.parents.items():
+        own = at_rest(nodes[index])
+        motions[index] = own if above is None else motions[above] @ own
     holders = [(index, node) for index, node in enumerate(nodes) if "mesh" in node]
-    places: list[tuple[Entry, Float[Tensor, "4 4"]]] = []
-    for index, node in holders:
-        motion = torch.eye(4, dtype=torch.float64)
-        for above in document.chain(nodes, index):
-            motion = at_rest(nodes[above]) @ motion
-        places.append((document.item("meshes", node, "mesh"), motion))
+    places = [(document.item("meshes", node, "mesh"), motions[index]) for index, node in holders]
     if not holders:
         places = [(mesh, torch.eye(4, dtype=torch.float64)) for mesh in document.items("meshes")]
     for mesh, motion in places:
@@ -152,6 +151,8 @@ def _primitives(document: Gltf) -> list[Primitive]:
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
             if SPLATS in extensions:
                 found.append(_primitive(document, primitive, extensions.entry(SPLATS), motion))
+                count += found[-1].count
+                check_count(document.path, count)  # before more is unpacked
     return found
 
 
