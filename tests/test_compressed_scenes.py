@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ from aaplug.io.scenes import (
     find_scene,
     ply,
     read_scene,
+    sog,
     usd,
     write_scene,
 )
@@ -162,6 +164,12 @@ def test_each_format_is_recognized_and_read_in_parts_and_written_as_ply(tmp_path
             "names 41 Gaussians in files that hold 40",
         ),
         ("lod-meta.json", '"0":', '"2":', "names 0 Gaussians in files that hold 0"),
+        (
+            "lod-meta.json",
+            '1_0/meta.json"], "tree": {"children": [',
+            '0_0/../0_0/meta.json"], "tree": {"children": [{"lods": {"0": {"file": 1}}}, ',
+            "names 80 Gaussians in files that hold 40",
+        ),
         ("scene.lcc2", '"name": 0', '"name": 7', "name should be a whole number from 0 to 2, not 7"),
         ("scene.lcc2", "b.spz", "scene.lcc2", "names 'scene.lcc2', which is neither a SOG nor a .spz"),
     ],
@@ -173,6 +181,22 @@ def test_an_index_that_its_files_do_not_bear_out_is_refused(tmp_path: Path, name
     path.write_text(text.replace(old, new))
     with pytest.raises(FormatError, match=match):
         read_scene(path)
+
+
+def test_files_of_an_index_have_a_limit_in_all_before_the_next_is_unpacked(tmp_path: Path, monkeypatch):
+    path, opened = write_file(tmp_path, "lod-meta.json"), list[Path]()
+    original = sog.open_scene
+    monkeypatch.setattr(sog, "open_scene", lambda file, options: opened.append(file) or original(file, options))
+    for copy in "bcdef":
+        copytree(tmp_path / "0_0", tmp_path / copy)
+    files = [f"{folder}/meta.json" for folder in ("0_0", *"bcdef")]
+    children = [{"lods": {"0": {"file": place}}} for place in range(len(files))]
+    write_json(path, {"version": 1, "filenames": files, "tree": {"children": children}})
+    assert (read_scene(path).count, len(opened)) == (240, 6)
+    monkeypatch.setenv("AAPLUG_GAUSSIANS", "100")
+    with pytest.raises(FormatError, match="holds 120 Gaussians and the limit is 100"):
+        read_scene(path)
+    assert len(opened) == 6 + 3
 
 
 WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat) and (f.needs is None or find_spec(f.needs))]

@@ -20,7 +20,7 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
 from aaplug.io.scenes.packed import Piece, rows_of
-from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
+from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
 from aaplug.system.errors import FormatError, counted
@@ -34,22 +34,24 @@ class Chunks:
 
     path: Path
     options: SceneFileOptions
-    opened: dict[str, Scene] = field(default_factory=dict)
+    opened: dict[Path, Scene] = field(default_factory=dict)
 
     def open(self, name: str) -> Scene:
-        """One file."""
-        if name in self.opened:
-            return self.opened[name]
+        """One file, however its name is spelt."""
         file = self.path.parent / name
-        if not file.resolve().is_relative_to(self.path.parent.resolve()):
+        place = file.resolve()
+        if place in self.opened:
+            return self.opened[place]
+        if not place.is_relative_to(self.path.parent.resolve()):
             raise FormatError(self.path, f"names {name!r}, which leads out of its folder")
         head = read_start(file, HEAD_BYTES)
         format = next((each for each in (sog, spz) if each.sniff(file, head)), None)
         if format is None:
             raise FormatError(self.path, f"names {name!r}, which is neither a SOG nor a .spz")
         axes = "opencv" if self.options.spz_axes == "auto" else self.options.spz_axes  # SOGs' in such an index
-        self.opened[name] = format.open_scene(file, replace(self.options, spz_axes=axes))
-        return self.opened[name]
+        self.opened[place] = format.open_scene(file, replace(self.options, spz_axes=axes))
+        check_count(self.path, sum(chunk.count for chunk in self.opened.values()))  # before more are unpacked
+        return self.opened[place]
 
     def rows(self, names: list[str], entry: Entry, key: str, start: str) -> Piece:
         """The rows that an entry names by the number of the file, their first one and how many, or all from there."""
