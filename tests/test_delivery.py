@@ -212,6 +212,7 @@ def ParticleField3DGaussianSplat "a" {facts["more"]}
 {{
     uniform int radiance:sphericalHarmonicsDegree = {facts["degree"]}
     double3 xformOp:translate = (1, 2, 3)
+    rel material:binding = </a>
     uniform token[] xformOpOrder = ["xformOp:translate"]
 {chr(10).join(lines)}
 }}
@@ -245,6 +246,7 @@ def test_a_usd_core_that_does_not_know_splats_is_refused(tmp_path: Path, monkeyp
         ({"layers": "subLayers = [@other.usda@]"}, "is composed with another layer"),
         ({"more": "( references = @other.usda@ )"}, "is composed with another layer"),
         ({"more": "( payload = @../other.usda@ )"}, "is composed with another layer"),
+        ({"more": "( clips = { dictionary a = { asset[] assetPaths = [@../other.usda@] } } )"}, "value clips"),
         ({"degree": 3}, "640 values"),
         ({"degree": 5}, "from 0 to 4"),
         ({"scales": [[1, 1, 1]]}, "scales should be 40 values"),

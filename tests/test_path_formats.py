@@ -203,6 +203,7 @@ def Xform "rig"
 {
     double3 xformOp:translate.timeSamples = { 1: (0, 0, 5), 3: (2, 0, 5) }
     uniform token[] xformOpOrder = ["xformOp:translate"]
+    rel material:binding = </rig/cam>
     def Camera "cam"
     {
         float focalLength.timeSamples = { 1: 18, 3: 36 }
@@ -255,6 +256,17 @@ def test_frames_of_usd_are_those_of_its_stage_and_one_key_holds(tmp_path, old, n
     path = read_camera_path(written(tmp_path, "path.usda", text))
     assert (path.fps, len(path.cameras), path.cameras[-1].centre[2].item(), path.unsized) == (24, frames, z, True)
     assert path.shutter == (0.5 if frames < 5 else 1)
+
+
+@pytest.mark.parametrize("variant", [False, True])
+def test_values_of_other_layers_are_not_read(tmp_path, variant):
+    pytest.importorskip("pxr")
+    clips = "clips = { dictionary a = { asset[] assetPaths = [@../out.usda@] } }"
+    inner = f'variantSet "v" = {{ "x" (\n{clips}\n) {{ }} }}' if variant else ""
+    outer = 'variants = { string v = "x" }\nprepend variantSets = "v"' if variant else clips
+    text = USDA.replace('"rig"\n{', f'"rig" (\n{outer}\n)\n{{\n{inner}')
+    with pytest.raises(FormatError, match="has value clips, which are other layers"):
+        read_camera_path(written(tmp_path, "path.usda", text))
 
 
 @pytest.mark.parametrize("layer", ["../out.usda", "/etc/out.usda", "http://x/a.usda"])

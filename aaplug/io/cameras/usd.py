@@ -80,6 +80,8 @@ def _check_layers(path: Path) -> None:
         layer = Sdf.Layer.FindOrOpen(left.pop())
         if layer is None:
             raise FormatError(path, "cannot be read: it is no USD, or a layer that it names is missing")
+        if _has_clips(layer):
+            raise FormatError(path, "has value clips, which are other layers; flatten it into one file")
         for asset in filter(None, layer.GetCompositionAssetDependencies()):
             name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
             file = name.partition("[")[0]  # a package's own file stands in brackets
@@ -90,6 +92,18 @@ def _check_layers(path: Path) -> None:
                 left.append(name)
         if len(seen) > MAX_LAYERS:
             raise FormatError(path, f"names more than {MAX_LAYERS} layers")
+
+
+def _has_clips(layer: Any) -> bool:
+    """True if a prim has value clips: layers that no composition names, which reading a value opens."""
+    keys = list[str]()
+
+    def look(path: Any) -> None:
+        spec = layer.GetObjectAtPath(path)  # None of a relationship's target
+        keys.extend(spec.ListInfoKeys() if spec else ())
+
+    layer.Traverse(module("Sdf").Path.absoluteRootPath, look)
+    return any(key.startswith("clip") for key in keys)
 
 
 def _moves(camera: Any) -> bool:

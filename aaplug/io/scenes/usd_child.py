@@ -30,11 +30,25 @@ def limit_memory(path: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
 
 
+def has_clips(layer: Any) -> bool:
+    """True if a prim has value clips: layers that no composition names, which reading a value opens."""
+    keys = list[str]()
+
+    def look(path: Any) -> None:
+        spec = layer.GetObjectAtPath(path)  # None of a relationship's target
+        keys.extend(spec.ListInfoKeys() if spec else ())
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, look)
+    return any(key.startswith("clip") for key in keys)
+
+
 def foreign_layer(path: str) -> str | None:
     """A layer that the stage is composed with, other than those of its own package; None if there is none."""
     left, seen = [path], set[str]()
     while left:
         layer = Sdf.Layer.FindOrOpen(left.pop())
+        if has_clips(layer):
+            return "value clips"
         for asset in filter(None, layer.GetCompositionAssetDependencies()):
             name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
             file, inside, _ = name.partition("[")
