@@ -1,11 +1,13 @@
 """Outputs appear whole or not at all, and never in place of an input."""
 
 import errno
+import fcntl
 import os
 import signal
 import subprocess
 import sys
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -16,6 +18,7 @@ from aaplug.io.atomic import check_output, claimed, output_folder, replacing, wr
 from aaplug.io.image_formats import Storage
 from aaplug.io.layers import write_layers
 from aaplug.io.scenes import write_scene
+from aaplug.system import locks
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
 from tests.conftest import exit_code, files_of_at_most, make_scene
@@ -39,6 +42,31 @@ def only_the_old_file_is_there(path: Path) -> bool:
     return path.read_bytes() == OLD and list(path.parent.iterdir()) == [path]
 
 
+@pytest.fixture(params=["posix", "windows"])
+def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """POSIX, or Windows: without flock, and a file that a process has open is neither removed nor renamed."""
+
+    def refusing(call: Callable[..., None]) -> Callable[..., None]:
+        def called(*paths: str | Path) -> None:
+            opened = set[str]()
+            for descriptor in Path("/proc").glob("[0-9]*/fd/*"):
+                with suppress(OSError):  # it has gone
+                    opened.add(os.readlink(descriptor))
+            if any(os.path.realpath(path) in opened for path in paths):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            call(*paths)
+
+        return called
+
+    if request.param == "windows":
+        monkeypatch.setitem(sys.modules, "fcntl", None)
+        monkeypatch.setattr(locks, "OPEN_IS_HELD", True)
+        for name in ("replace", "unlink"):
+            monkeypatch.setattr(os, name, refusing(getattr(os, name)))
+    return request.param
+
+
+@pytest.mark.usefixtures("system")
 def test_an_existing_file_needs_overwrite(output: Path):
     with pytest.raises(OutputError, match="pass `overwrite`"):
         write(output, NEW)
@@ -47,6 +75,7 @@ def test_an_existing_file_needs_overwrite(output: Path):
     assert output.read_bytes() == NEW
 
 
+@pytest.mark.usefixtures("system")
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, ValueError])
 def test_whatever_interrupts_leaves_the_old_file(output: Path, failure: type[BaseException]):
     def interrupted() -> None:
@@ -186,6 +215,7 @@ with claimed(path), replacing(path / "file", False) as stream:
 """
 
 
+@pytest.mark.usefixtures("system")
 def test_an_output_is_written_by_one_process_and_a_killed_one_leaves_nothing(tmp_path: Path):
     words = [sys.executable, "-c", CLAIM, str(tmp_path)]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
@@ -202,6 +232,18 @@ def test_an_output_is_written_by_one_process_and_a_killed_one_leaves_nothing(tmp
     with claimed(tmp_path):
         write(tmp_path / "file", NEW)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_killed_process_refuses_nothing_where_no_lock_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def work() -> None:
+        with claimed(tmp_path):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    assert exit_code(work) == -signal.SIGKILL
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))))
+    with claimed(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_only_what_is_surely_ours_is_removed(tmp_path: Path):

@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 from aaplug.system.contracts import contract
 from aaplug.system.errors import OutputError, listing, of_system, reason
-from aaplug.system.locks import OUR_PREFIX, new_file, remove_left
+from aaplug.system.locks import OUR_PREFIX, let_move, new_file, remove_left
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 HASH_DIGITS = 16  # in the name of a claim
@@ -60,7 +60,8 @@ def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iter
     remove_left(target.parent)
     with output_folder(target.parent):
         try:
-            with new_file(temporary):
+            with new_file(temporary) as held:
+                let_move(held)  # whatever writes it opens it, or replaces it
                 yield temporary
                 _sync(temporary, os.O_RDWR)
                 os.replace(temporary, target)
@@ -95,12 +96,13 @@ def claimed(path: AnyPath) -> Iterator[None]:
     mark = path / name if path.is_dir() else path.with_name(name)
     with ExitStack() as stack:
         try:
-            stack.enter_context(new_file(mark))
+            held = stack.enter_context(new_file(mark))
         except FileExistsError as error:
             raise OutputError(path, "is being written by another process") from error
         except OSError as error:
             raise OutputError(path, f"cannot be written: {reason(error)}") from error
         stack.callback(mark.unlink, missing_ok=True)
+        stack.callback(let_move, held)
         yield
 
 

@@ -1,8 +1,9 @@
 """Locks that end with their process, and removal of what killed processes left behind.
 
 A lock is the system's own (flock) on an open file.  It ends with its process, also after kill -9, so no lock is ever
-stale.  Where the system has none, nothing is refused and nothing is removed.  Only names that aaplug alone gives are
-ever removed: hidden files beside outputs, and folders of temporary files that hold a mark.
+stale.  Windows has no flock, but neither removes nor renames a file that is open, so that being open is the lock of a
+new file.  On a file system without locks nothing is refused and nothing of others is removed.  Only names that aaplug
+alone gives are ever removed: hidden files beside outputs, and folders of temporary files that hold a mark.
 """
 
 import os
@@ -13,12 +14,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
 OUR_PREFIX = ".aaplug-"  # begins the name of every temporary file beside an output; 16 hex digits and a suffix follow
 OUR_FILE_NAME = re.compile(r"\.aaplug-[0-9a-f]{16}(\.\w+)?", re.ASCII)
 SCRATCH_PREFIX = "aaplug-scratch-"  # begins the name of every folder of temporary files
 SAFE_FLAGS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)  # neither waits for a pipe nor follows a link
 LOCK_FILE_NAME = "aaplug.lock"  # the locked file in such a folder
+OPEN_IS_HELD = os.name == "nt"  # Windows neither removes nor renames a file that is open
 
 
 def lock(descriptor: int, wait: bool = False) -> bool | None:
@@ -35,24 +38,26 @@ def lock(descriptor: int, wait: bool = False) -> bool | None:
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[None]:
-    """Make an empty file and lock it inside the block, so that nobody removes it.
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """Make an empty file and lock it inside the block, so that nobody removes it; `let_move` comes before a new name.
 
     Raises:
         OSError: a process holds it already, or it cannot be made.
     """
     with suppress(FileNotFoundError):
-        _remove_unless_held(path)
+        _remove_unless_held(path, unsure=True)
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        try:
-            lock(descriptor, wait=True)
-            if not _is_at(descriptor, path):  # removed before it was locked
+        with open(path, "x+b", buffering=0) as file:
+            if lock(file.fileno(), wait=True) and not _is_at(file.fileno(), path):  # removed before it was locked
                 continue
-            yield
+            yield file
             return
-        finally:
-            os.close(descriptor)
+
+
+def let_move(file: BinaryIO) -> None:
+    """Close a new file that is to be renamed or removed, where the system does neither with one that is open."""
+    if OPEN_IS_HELD:
+        file.close()
 
 
 @contextmanager
@@ -86,11 +91,21 @@ def remove_left(folder: Path) -> None:
                     _remove_unless_held(path / LOCK_FILE_NAME, path)
 
 
-def _remove_unless_held(path: Path, folder: Path | None = None) -> None:
-    """Remove a file, or the folder that it marks, if it is ordinary and no process holds it."""
+def _remove_unless_held(path: Path, folder: Path | None = None, unsure: bool = False) -> None:
+    """Remove a file, or the folder that it marks, if it is ordinary and no process holds it.
+
+    unsure: remove it also where nothing tells whether a process holds it.
+    """
+    if OPEN_IS_HELD:
+        with suppress(PermissionError):  # a process holds it
+            path.unlink()
+            if folder is not None:
+                shutil.rmtree(folder)
+        return
     descriptor = os.open(path, os.O_RDWR | SAFE_FLAGS)
     try:
-        if os.path.isfile(path) and lock(descriptor) and _is_at(descriptor, path):
+        free = lock(descriptor)
+        if os.path.isfile(path) and (unsure if free is None else free) and _is_at(descriptor, path):
             path.unlink() if folder is None else shutil.rmtree(folder)
     finally:
         os.close(descriptor)
