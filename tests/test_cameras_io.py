@@ -6,7 +6,7 @@ import math
 import os
 import struct
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 import pytest
@@ -736,6 +736,17 @@ def test_pinhole_values(tmp_path):
     assert names(views.test) == ["camera_00", "camera_05", "camera_10"]
 
 
+def test_names_have_slashes_on_windows_too(tmp_path, monkeypatch):
+    folders = ("left", "right")
+    for folder in folders:
+        photo(tmp_path / folder / "a.png", 40, 20)
+    frames = [{"file_path": f"{folder}/a.png"} for folder in folders]
+    file = write_json(tmp_path / "transforms.json", transforms(frames, w=40, h=20))
+    relative = Path.relative_to
+    monkeypatch.setattr(Path, "relative_to", lambda *each: PureWindowsPath(relative(*each)))
+    assert names(read_cameras(file).all) == ["left/a", "right/a"]
+
+
 # Camera paths, LLFF, multi-scale Blender ---------------------------------------------------------
 
 
@@ -762,6 +773,7 @@ def test_llff_axes_are_down_right_and_back(tmp_path):
     assert names(cameras.test) == ["000", "008"]
     for i in range(9):
         photo(tmp_path / "images" / f"IMG_{i}.JPG", 20, 10)
+        (tmp_path / "images" / f"._IMG_{i}.JPG").write_bytes(b"macOS's")
     camera = read_cameras(tmp_path / "poses_bounds.npy").train[0]
     assert (camera.name, camera.fx, camera.hw) == ("IMG_1", 15, (10, 20))
 

@@ -72,6 +72,8 @@ def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):
 def test_every_verb_that_takes_a_scene_in_time_takes_all_frames(folder, tmp_path):
     write_scene(folder / "other.ply", make_scene(40))
     write_scene(folder / "frame_0004.splat", make_scene(40))
+    for hidden in ("._frame_0001.ply", "._frame_0002.ply", "._other.ply"):  # macOS's, on other systems' drives
+        (folder / hidden).write_bytes(b"extended attributes")
     scene = read_scene(folder)
     assert scene.notes[-1] == "no frames, and left out: frame_0004.splat, other.ply"
     assert scene.cameras is None

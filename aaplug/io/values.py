@@ -150,6 +150,14 @@ def read_part(path: Path, start: int, size: int, short: bool = False) -> bytes:
     return data
 
 
+def visible(folder: Path) -> list[Path]:
+    """What a folder holds, by name, without hidden files such as macOS's ._0001.jpg; nothing if it cannot be listed."""
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError:
+        return []
+
+
 def read_bounded(path: Path, limit: int) -> bytes:
     """The bytes of a file that is not longer than `limit`."""
     data = read_start(path, limit + 1)

@@ -18,7 +18,7 @@ from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_pho
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import Place, focal, number, pixels, read_bounded
+from aaplug.io.values import Place, focal, number, pixels, read_bounded, visible
 from aaplug.system.errors import FormatError
 
 FILE = "poses_bounds.npy"
@@ -38,10 +38,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     file = path / FILE if os.path.isdir(path) else path
     rows = _rows(file)
     folder = photo_folder(file.parent, options, "images", Place(file, "images"))
-    try:
-        names = sorted(p.name for p in folder.folder.iterdir() if p.suffix.lower() in SUFFIXES)
-    except OSError:
-        names = []
+    names = [p.name for p in visible(folder.folder) if p.suffix.lower() in SUFFIXES]
     photos = len(names)
     if photos != len(rows):
         names = [f"{i:03}" for i in range(len(rows))]

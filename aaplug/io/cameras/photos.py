@@ -16,7 +16,7 @@ from unicodedata import normalize
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.io.cameras.sets import CameraFileOptions
-from aaplug.io.values import Place
+from aaplug.io.values import Place, visible
 from aaplug.system.errors import FormatError, UsageError, listing, printable, reason
 
 CAMERA_FILE = re.compile(  # of any format
@@ -63,7 +63,7 @@ class PhotoFolder:
 
     def notes(self, cameras: Sequence[Camera]) -> list[str]:
         """Notes where no camera has its photo although there are folders of photos, or where there are masks."""
-        beside = _listed(self.folder.parent)
+        beside = visible(self.folder.parent)
         others = [path.name for path in beside if PHOTO_FOLDERS[1].fullmatch(path.name) and path != self.folder]
         notes = [MASKED] if any(path.name == MASKS for path in beside) else []
         if photographs(cameras) or not (others or self.folder in beside):
@@ -105,12 +105,12 @@ def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
     photos = photographs(cameras.all)
     files = [path, *photos]
     for folder in (home, home / "sparse", home / "sparse" / "0", home / "0"):
-        files += [file for file in _listed(folder) if CAMERA_FILE.fullmatch(file.name)]
+        files += [file for file in visible(folder) if CAMERA_FILE.fullmatch(file.name)]
     photo_folders = {photo.parent for photo in photos}
     for folder, names in product(photo_folders, PHOTO_FOLDERS):
-        beside = _listed(folder.parent) if names.fullmatch(folder.name) else []
+        beside = visible(folder.parent) if names.fullmatch(folder.name) else []
         for each in filter(lambda path: names.fullmatch(path.name), beside):
-            files += [file for file in _listed(each) if file.suffix.lower() in SUFFIXES]
+            files += [file for file in visible(each) if file.suffix.lower() in SUFFIXES]
     return tuple(dict.fromkeys(files))
 
 
@@ -122,13 +122,6 @@ def _is_file(path: Path) -> bool:
         raise FormatError(path.parent, f"cannot be looked into: {reason(error)}") from error
     except (OSError, ValueError):
         return False
-
-
-def _listed(folder: Path) -> list[Path]:
-    try:
-        return sorted(folder.iterdir())
-    except OSError:
-        return []
 
 
 def without_suffix(name: str) -> str:

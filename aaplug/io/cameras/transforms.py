@@ -106,7 +106,9 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     folder = PhotoFolder(file.parent, file.parent)
     paths = [_plain(frame.get("file_path", text)) for frame in frames]
     photos = [None if EXPORTED in f else folder.find(path, f.place) for f, path in zip(frames, paths, strict=True)]
-    found = [str(photo.relative_to(file.parent)) if photo else path for path, photo in zip(paths, photos, strict=True)]
+    found = [
+        photo.relative_to(file.parent).as_posix() if photo else path for path, photo in zip(paths, photos, strict=True)
+    ]
     names = distinct(file, found, (last_part, without_suffix, str))
     photo = next(filter(None, photos), None)
     spare = image_size(photo) if photo else None  # for frames without w, h and photo

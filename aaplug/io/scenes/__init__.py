@@ -25,7 +25,7 @@ from aaplug.io.scenes.faults import described_faults, faults_of
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
-from aaplug.io.values import read_start
+from aaplug.io.values import read_start, visible
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, PlugInError, UsageError, listing
 from aaplug.system.extras import check_installed
@@ -172,7 +172,7 @@ def read_scene(
         frames = SceneFrames((*numbered,), (*numbered.values(),), reading, frames_apart)
         frames.check()
         suffixes, names = tuple(f".{format.name}" for format in formats), {file.name for file in frames.paths}
-        others = sorted(f.name for f in given.iterdir() if f.name.lower().endswith(suffixes) and f.name not in names)
+        others = [f.name for f in visible(given) if f.name.lower().endswith(suffixes) and f.name not in names]
         notes = (*scene.notes, f"the first of {len(frames)} frames, to {frames.paths[-1].name}")
         if others:
             notes = (*notes, f"no frames, and left out: {listing(others)}")
@@ -320,7 +320,7 @@ def frame_files(folder: Path) -> dict[Path, str]:
 
     Raises FormatError where frames are missing or there twice, or of several sequences.
     """
-    matches = [match for path in folder.glob("*.ply") if (match := NUMBERED.fullmatch(path.name))]
+    matches = [match for path in visible(folder) if (match := NUMBERED.fullmatch(path.name))]
     named: dict[tuple[str, str], list[re.Match[str]]] = {}
     for match in sorted(matches, key=lambda match: (int(match[2]), match[0])):
         named.setdefault((match[1], match[3]), []).append(match)
