@@ -12,6 +12,7 @@ from aaplug_cli.main import main
 
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.views import file_names
 from tests.conftest import exit_code, make_camera
 
 WORDS = "video scene.ply --cameras . --scale 0.5 --seconds 0.2 -o"
@@ -28,6 +29,19 @@ def test_a_name_with_places_or_a_folder_with_a_format_is_a_sequence(cli):
     assert sorted(bytes_of("a")) == sorted([*names, "shot.json"])
     cli.done(f"{WORDS} b --format jpg --threads 2")
     assert sorted(bytes_of("b")) == [*(f"frame.{i:04d}.jpg" for i in range(1, 7)), "frame.json"]
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (["a:b?", "sub/c.d", "..e.", ""], ["a_b_", "sub_c.d", "e", "view"]),
+        (["CON", "nul.left", "com1.", "console"], ["_CON", "_nul.left", "_com1", "console"]),  # Windows' devices
+        (["A", "a"], ["00000_A", "00001_a"]),
+        (["h\u00e9", "he\u0301"], ["00000_h\u00e9", "00001_h\u00e9"]),  # macOS takes both spellings for one
+    ],
+)
+def test_names_of_files_are_names_on_every_system(names: list[str], files: list[str]):
+    assert file_names(names, "view", 5) == files
 
 
 def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):

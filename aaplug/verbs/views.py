@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
+from unicodedata import normalize
 
 from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import NEEDS_PINHOLE, Camera
@@ -25,6 +26,7 @@ SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixe
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif", *CODECS)  # any other name is a folder
 Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
+DEVICE = re.compile("con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)  # no file on Windows, whatever its suffix
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
 
 
@@ -143,9 +145,10 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: 
 
 
 def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
-    """Names fit for files; all are numbered where two would be the same."""
-    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless for name in names]
-    slugs = [slug.encode()[:LONGEST_NAME].decode(errors="ignore") for slug in slugs]
+    """Names fit for files on any system; all are numbered where two would be the same on one."""
+    slugs = [re.sub(r"[^\w.\-]+", "_", normalize("NFC", name)).lstrip(".") for name in names]
+    slugs = [slug.encode()[:LONGEST_NAME].decode(errors="ignore").rstrip(".") or nameless for slug in slugs]
+    slugs = [f"_{slug}" if DEVICE.fullmatch(slug.partition(".")[0]) else slug for slug in slugs]
     if len({slug.casefold() for slug in slugs}) < len(slugs):
         return [f"{index:0{digits}d}_{slug}" for index, slug in enumerate(slugs)]
     return slugs
