@@ -225,8 +225,7 @@ def test_a_host_that_cannot_be_listened_at_is_refused_by_name(seen, host):  # no
 
 
 def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
-    event = SimpleNamespace(wait=Mock(side_effect=KeyboardInterrupt))
-    monkeypatch.setattr("aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: event))
+    monkeypatch.setattr("aaplug.verbs.view.time", SimpleNamespace(sleep=Mock(side_effect=KeyboardInterrupt)))
     _, err = cli.done("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
     assert "open http://127.0.0.1:" in err
     assert err.splitlines()[-1] == "closed"
@@ -234,9 +233,7 @@ def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
 
 def test_a_browser_in_the_terminal_is_not_opened_and_without_a_scene_the_sample_is_seen(monkeypatch):
     opened = []
-    monkeypatch.setattr(
-        "aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
-    )
+    monkeypatch.setattr("aaplug.verbs.view.time", SimpleNamespace(sleep=Mock(side_effect=KeyboardInterrupt)))
     for browser in (webbrowser.GenericBrowser("lynx"), SimpleNamespace(open=opened.append)):
         monkeypatch.setattr(webbrowser, "get", lambda chosen=browser: chosen)
         view(port=0)

@@ -1,6 +1,6 @@
 """A scene live in the browser."""
 
-import threading
+import time
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -16,6 +16,7 @@ from aaplug.system.extras import check_installed
 from aaplug.verbs.verb import looks
 
 SAMPLE = "chair.ply"
+WAIT_SECONDS = 3600.0  # at once, for the interrupt that ends a view
 
 
 @looks(LiveOptions)
@@ -73,6 +74,7 @@ def view(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions) ->
                 if type(browser) is not webbrowser.GenericBrowser:  # that runs in the terminal, and would take it over
                     browser.open(address)
         try:
-            threading.Event().wait()
+            while True:
+                time.sleep(WAIT_SECONDS)  # Windows hears no Ctrl-C in the wait for an event
         except KeyboardInterrupt:  # the usual end
             say("closed")
