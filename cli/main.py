@@ -27,6 +27,7 @@ DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting sc
   aaplug convert scene.ply --cameras path/to/colmap -o converted.ply
   aaplug VERB --help"""
 PLOTS_FOLDER = "MPLCONFIGDIR"  # of the environment; matplotlib sets it to a temporary folder if home is read-only
+READER_GONE = (errno.EPIPE, errno.EINVAL)  # what writing to a pipe that nobody reads meets; the latter on Windows
 UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 
 
@@ -76,7 +77,9 @@ def _printing(code: int = 0) -> Iterator[None]:
             yield
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno not in READER_GONE:
+            raise
         _drop_output()
         sys.exit(code)
 

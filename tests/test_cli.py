@@ -1,13 +1,17 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.io.images import image_size
@@ -198,6 +202,16 @@ def test_a_reader_that_leaves_early_is_no_failure(entry, words):
         run.stdout.close()
         err = run.stderr.read()
     assert (run.returncode, err) == (0, "")
+
+
+@pytest.mark.parametrize("at", ["write", "flush"])
+def test_windows_words_for_a_reader_that_left_are_none_for_the_user(at, monkeypatch, capsys):
+    gone = OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
+        monkeypatch.setattr(sys, "stdout", Mock(wraps=nowhere, **{at: Mock(side_effect=gone)}))
+        with pytest.raises(SystemExit) as end:
+            main(["viewers", "--json"])
+    assert (end.value.code, capsys.readouterr().err) == (0, "")
 
 
 @pytest.mark.parametrize(("closed", "words", "code"), [(1, "viewers", 0), (2, "viewers", 0), (2, "render", 2)])
