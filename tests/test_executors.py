@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from functools import partial
 from itertools import chain, count
@@ -14,6 +15,7 @@ from pathlib import Path
 from threading import Lock
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import jaxtyping
 import psutil
@@ -73,6 +75,15 @@ def test_threads_read_few_items_ahead():
 def test_a_process_that_dies_is_one_clear_error():
     with pytest.raises(UsageError, match="worker process: died"):
         list(Processes(1).map(os._exit, [3]))
+
+
+def test_no_more_processes_are_asked_for_than_windows_takes(monkeypatch):
+    windows = SimpleNamespace(**{**vars(sys), "platform": "win32"})
+    for module in ("concurrent.futures.process", "aaplug.system.executors"):
+        monkeypatch.setattr(f"{module}.sys", windows)
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", Mock(side_effect=ZeroDivisionError))
+    with pytest.raises(ZeroDivisionError):
+        list(Processes(128).map(abs, [1]))
 
 
 def test_a_disk_that_is_full_is_named(tmp_path, monkeypatch):

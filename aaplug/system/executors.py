@@ -37,6 +37,7 @@ QUIET_TRACKER = "ignore::UserWarning:multiprocessing.resource_tracker"
 
 WORK_FILE_NAME = "work.pt"  # file with the function of the workers, in a folder of temporary files
 PAYS_AFTER_SECONDS = 20.0  # two processes take five seconds to start, and save two fifths
+WINDOWS_PROCESSES = 61  # that a pool can have there
 ITEMS_PER_WORKER = 2  # waiting or at work, so that no worker is idle
 
 T = TypeVar("T")
@@ -103,9 +104,10 @@ class Processes:
                 return
             track_quietly()
             context = SpawnContext() if needs else _WithoutScript()
-            pool = ProcessPoolExecutor(self.workers, context, _start, (str(folder),))
+            workers = min(self.workers, WINDOWS_PROCESSES) if sys.platform == "win32" else self.workers
+            pool = ProcessPoolExecutor(workers, context, _start, (str(folder),))
             try:
-                most = ITEMS_PER_WORKER * self.workers
+                most = ITEMS_PER_WORKER * workers
                 yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
             except (KeyboardInterrupt, GeneratorExit, SystemExit):  # the items at work need not be finished
                 for process in getattr(pool, "_processes", None) or {}:
