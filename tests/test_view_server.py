@@ -17,6 +17,7 @@ import torch
 from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
+from aaplug.system.locks import LOCK_FILE_NAME, SCRATCH_PREFIX
 from aaplug.verbs.view import serving, view
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
 
@@ -191,6 +192,15 @@ def test_a_file_that_cannot_be_opened_is_refused(address):
             assert words in header["refused"]
             assert "/tmp" not in header["refused"]
         assert ask(page)["stage"] == "done"
+
+
+def test_the_folder_of_dropped_files_is_removed_by_others_once_its_server_was_killed(address, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with connected(address) as page:
+        page.recv()
+        [folder] = tmp_path.iterdir()
+        assert folder.name.startswith(SCRATCH_PREFIX)
+        assert [path.name for path in folder.iterdir()] == [LOCK_FILE_NAME]
 
 
 def test_garbage_harms_nobody(address, capfd):

@@ -22,7 +22,6 @@ from os import sep, strerror
 from pathlib import Path
 from shutil import disk_usage
 from socket import gaierror, gethostname
-from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -36,6 +35,7 @@ from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
 from aaplug.live.webpage import page
 from aaplug.system.errors import AaplugError, UsageError, reason
+from aaplug.system.locks import scratch
 
 WEBSOCKET_PATH = "/live"
 MAX_OPEN_PAGES = 32
@@ -126,7 +126,7 @@ class Server:
         self._open_pages += 1
         try:
             with (
-                TemporaryDirectory() as folder,
+                scratch() as folder,
                 self._studio.page(partial(self._post, connection, outbox)) as client,
                 suppress(ConnectionClosed),
             ):
@@ -143,12 +143,12 @@ class Server:
                             continue
                         request = parse(said, subject.recipes, len(subject.views))
                         if isinstance(request, OpenRequest):
-                            file = IncomingFile(Path(folder), request, allowed=self._token is None)
+                            file = IncomingFile(folder, request, allowed=self._token is None)
                             await connection.send(message({"take": request.name}, []))
                         else:
                             self._studio.receive(client, request)
                     except (AaplugError, MemoryError, OSError) as error:
-                        file, why = None, str(error).replace(folder + sep, "") or "out of memory"
+                        file, why = None, str(error).replace(f"{folder}{sep}", "") or "out of memory"
                         await connection.send(message({"refused": why}, []))
         finally:
             self._open_pages -= 1
