@@ -168,6 +168,16 @@ def test_an_input_is_never_an_output(output: Path, disguise: str):
         check_output(other, True, [output.parent / "missing", output])
 
 
+def test_files_without_numbers_are_told_apart_by_name(output: Path, monkeypatch: pytest.MonkeyPatch):
+    (other := output.parent / "other").touch()
+    (link := output.parent / "link").symlink_to(other)
+    stat = os.stat
+    monkeypatch.setattr(os, "stat", lambda *path, **how: os.stat_result([stat(*path, **how)[0], 0, *[0] * 8]))
+    check_output(output, True, [other])
+    with pytest.raises(OutputError, match="is also the input"):
+        check_output(link, True, [other])
+
+
 def test_checking_creates_nothing(output: Path):
     check_output(output.parent / "new", False, [output])
     check_output(output, True, [output.parent / "missing"])

@@ -27,7 +27,7 @@ from aaplug.system.locks import OUR_PREFIX, let_move, new_file, remove_left
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 HASH_DIGITS = 16  # in the name of a claim
 
-FileId = tuple[int, int]  # device and number on it: the same for every name of a file
+FileId = tuple[int, int | str]  # device, and number on it, or path where a drive gives 0: the same for every name
 AnyPath = str | PathLike[str]
 _open_outputs = list[AnyPath]()  # of the blocks of `writing` in this process
 _inputs = dict[FileId, AnyPath]()  # of these blocks and of those that ended inside them
@@ -219,7 +219,7 @@ def _ids_of(paths: Iterable[AnyPath]) -> dict[FileId, AnyPath]:
         with suppress(OSError, ValueError):
             if os.path.isfile(path):
                 status = os.stat(path)
-                ids[status.st_dev, status.st_ino] = path
+                ids[status.st_dev, status.st_ino or os.path.realpath(path)] = path
     return ids
 
 
