@@ -14,12 +14,11 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -199,9 +198,9 @@ class _Document:
     def __init__(self, path: Path, first: Gaussians, count: int) -> None:
         widths = {"POSITION": 12, f"{PREFIX}ROTATION": 16, f"{PREFIX}SCALE": 12, f"{PREFIX}OPACITY": 4}
         self.widths = widths | {COLOUR: 4} | dict.fromkeys(harmonics(first.sh_degree), 12)  # bytes a Gaussian
-        starts = np.cumsum([0, *self.widths.values()]) * count
-        self.starts = dict(zip(self.widths, starts[:-1].tolist(), strict=True))
-        self.size, self.first, self.count = int(starts[-1]), first, 0
+        *starts, self.size = (count * width for width in accumulate(self.widths.values(), initial=0))
+        self.starts = dict(zip(self.widths, starts, strict=True))
+        self.first, self.count = first, 0
         self.path = path
         self.least, self.most = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
         self.written = 0

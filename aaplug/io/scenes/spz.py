@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -131,8 +132,8 @@ def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | Non
             raise FormatError(path, f"version {header.version} should not be one gzip stream")
         parts, records = _streams(path, data, sizes)
     else:
-        payload, ends = _payload(path, data, sum(sizes), zipped), np.cumsum(sizes).tolist()
-        parts = (payload[end - size : end] for size, end in zip(sizes, ends, strict=True))
+        payload = _payload(path, data, sum(sizes), zipped)
+        parts = (payload[start:end] for start, end in pairwise(accumulate(sizes, initial=0)))
         records = payload[sum(sizes) :]
     shaped = zip(parts, header.widths, strict=True)
     sections = [np.frombuffer(part, np.uint8).reshape(header.count, width) for part, width in shaped]
