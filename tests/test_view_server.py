@@ -1,6 +1,7 @@
 """The live view's server: what a page may ask for, who is let in, and the command."""
 
 import asyncio
+import errno
 import json
 import math
 import re
@@ -222,10 +223,13 @@ def test_garbage_harms_nobody(address, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_a_busy_port_is_one_clear_line(address, cli):
+def test_a_busy_port_is_one_clear_line(address, cli, monkeypatch):
     port = address.split(":")[2].rstrip("/")
     said = f"--port: {port} of 127.0.0.1 cannot be used: address already in use"
-    cli.refused(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}", said)
+    words = f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}"
+    cli.refused(words, said)
+    monkeypatch.setattr(socket, "errorTab", {errno.EADDRINUSE: "The network address is in use."}, raising=False)
+    cli.refused(words, "cannot be used: the network address is in use")  # Windows' strerror does not know it
 
 
 @pytest.mark.parametrize("host", [70 * "x", "::g", "192.0.2.1"])  # no name; no address; another machine

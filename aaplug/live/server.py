@@ -10,6 +10,7 @@ import hmac
 import json
 import logging
 import secrets
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -21,7 +22,6 @@ from ipaddress import ip_address
 from os import sep, strerror
 from pathlib import Path
 from shutil import disk_usage
-from socket import gaierror, gethostname
 from urllib.parse import parse_qs
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -63,7 +63,7 @@ class Server:
     @property
     def address(self) -> str:
         """The address to open in a browser; by the machine's name where all of its addresses are listened on."""
-        named = gethostname() if self._host in ("", "0.0.0.0") else self._host
+        named = socket.gethostname() if self._host in ("", "0.0.0.0") else self._host
         host = f"[{named}]" if ":" in named else named
         token = "" if self._token is None else f"?token={self._token}"
         return f"http://{host}:{self._port}/{token}"
@@ -75,8 +75,10 @@ class Server:
             self._loop, self._port = self._started.result()
         except (OSError, UnicodeError) as error:
             self._thread.join()
-            code = None if isinstance(error, gaierror | UnicodeError) else error.errno
-            why = strerror(code).lower() if code else reason(error)  # asyncio's own words name the address once more
+            code = None if isinstance(error, socket.gaierror | UnicodeError) else error.errno
+            told = getattr(socket, "errorTab", {}).get(code)  # Windows' words, which its strerror does not have
+            # asyncio's own words name the address once more
+            why = (told or strerror(code)).lower().rstrip(".") if code else reason(error)
             if code in (None, EADDRNOTAVAIL):
                 raise UsageError("host", f"{self._host} cannot be used: {why}") from error
             raise UsageError("port", f"{self._port} of {self._host} cannot be used: {why}") from error
