@@ -51,8 +51,8 @@ def test_what_another_process_wrote_meanwhile_is_not_replaced(name, job, monkeyp
     @contextmanager
     def after_a_rival(path):
         written.write_bytes(b"rival's")
-        with real(path):
-            yield
+        with real(path) as file:
+            yield file
 
     monkeypatch.setattr(atomic, "new_file", after_a_rival)
     code, _, err = job(words)

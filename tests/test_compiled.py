@@ -540,7 +540,10 @@ def test_many_frames_build_what_is_missing(empty_cache, monkeypatch):
 def test_missing_kernels_are_built_beside_the_work_and_taken_up_once(empty_cache, monkeypatch, caplog):
     for name, value in {"PATIENCE_SECONDS": 0.0, "LOOK_SECONDS": 0.0, "has_compiler": lambda: True}.items():
         monkeypatch.setattr(on_demand, name, value)
-    program = "import sys; open('asked', 'a').write(' '.join(sys.argv[1:])); sys.exit('the disk is full')"
+    program = (
+        "import sys; open('asked', 'a').write(' '.join(sys.argv[1:]));"
+        "sys.stderr.buffer.write(b'\\x81' * 100_000 + b'\\n'); sys.exit('the disk is full')"  # more than a pipe holds
+    )
     monkeypatch.setattr(on_demand, "COMPILER", program)
     monkeypatch.chdir(empty_cache)
     kernels, looked_up = on_demand.OnDemandKernels(), []
@@ -548,7 +551,7 @@ def test_missing_kernels_are_built_beside_the_work_and_taken_up_once(empty_cache
     for _ in range(2):
         project(make_scene(50), make_camera(), kernels)
     assert kernels._compiler is not None
-    kernels._compiler.wait()
+    kernels._compiler.wait(20)
     for _ in range(3):
         project(make_scene(50), make_camera(), kernels)
     assert (empty_cache / "asked").read_text() == "project"

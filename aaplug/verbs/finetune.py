@@ -117,7 +117,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         scales = sorted({1.0, *settings.weights}, reverse=True)
-        if settings.steps and settings.usual_error:
+        if settings.steps and settings.usual_error and len(fused):
             first = evaluate(Task({"start": start}, scales, spread(train, PROBE_VIEWS), truth, (PSNR,), ceiling=False))
             settings = slowed(settings, {s: mean_square_error(first.select("start", s)) for s in scales})
         tuning = TuningJob(start, train, truth, settings, upsampler, method)

@@ -214,7 +214,8 @@ def _compiler() -> str:
 def _compiler_version(compiler: str) -> str:
     """The compiler's words about its version; empty if it does not run."""
     with suppress(OSError, subprocess.SubprocessError):
-        return subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=60).stdout
+        how = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
+        return subprocess.run([compiler, "--version"], **how).stdout
     return ""
 
 

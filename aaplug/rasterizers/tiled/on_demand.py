@@ -10,6 +10,7 @@ import math
 import os
 import subprocess
 import sys
+import threading
 import time
 
 from torch import Tensor
@@ -43,6 +44,7 @@ class OnDemandKernels(CompiledKernels):
         self._missing: set[str] = set()
         self._tried: set[str] = set()
         self._compiler: subprocess.Popen[str] | None = None
+        self._listener, self._errors = threading.Thread(), ""  # a pipe that nobody reads would stop the compiler
         self._can_build, self._next_look = has_compiler(), math.inf
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
@@ -71,14 +73,20 @@ class OnDemandKernels(CompiledKernels):
             self._tried |= self._missing
             environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
             command = [sys.executable, "-c", COMPILER, *names]
-            self._compiler = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+            how = {"stderr": subprocess.PIPE, "text": True, "errors": "replace", "env": environment}
+            self._compiler = subprocess.Popen(command, **how)
+            self._listener = threading.Thread(target=self._listen, args=(self._compiler,), daemon=True)
+            self._listener.start()
             atexit.register(self._compiler.terminate)
         elif self._compiler.poll() is not None:
-            _, errors = self._compiler.communicate()
+            self._listener.join()
             if self._compiler.returncode:
-                log.warning("kernels are not compiled, and run eagerly: %s", errors.strip().rpartition("\n")[2])
+                log.warning("kernels are not compiled, and run eagerly: %s", self._errors.strip().rpartition("\n")[2])
             for name in self._tried:
                 self._packages.pop(name, None)
             self._missing -= self._tried
             atexit.unregister(self._compiler.terminate)
             self._compiler, self._next_look = None, math.inf
+
+    def _listen(self, compiler: "subprocess.Popen[str]") -> None:
+        _, self._errors = compiler.communicate()
