@@ -379,11 +379,11 @@ def _tileset(stream: Stream, parts: Float[Tensor, "levels leaves 7"], rate: floa
 
 
 def _spark_settings(front: Front) -> dict[str, Any]:
-    """Settings of Spark by which its budget does not lower the detail."""
+    """Settings of Spark by which neither its budget nor splats packed into 16 bytes lower the detail."""
     leaves, rule = len(front.scene) - len(front.parents[front.parents >= 0].unique()), front.scene.convention
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.0, "blurAmount" if rule.compensated else "preBlurAmount": rule.kernel}
     budget = {"lodSplatCount": leaves, "lodRenderScale": MAX_NODE_SIZE}
-    return {"SparkRenderer": blur | budget}
+    return {"SparkRenderer": blur | budget | {"accumExtSplats": True}}
 
 
 def _box(parts: Float[Tensor, "*n 7"]) -> Box:
