@@ -154,12 +154,12 @@ def rates_in_chunks(
     intrinsics = [[c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.focal] for c in cameras]
     intrinsics = means.new_tensor(intrinsics)
     lenses = {i: camera for i, camera in enumerate(cameras) if camera.lens != PINHOLE}
-    planes = _planes(rotation, offset, intrinsics)
-    for part in _chunks(means, len(cameras), boxed=not lenses):
+    most, near = max(1, CHUNK_PAIRS // len(cameras)), torch.arange(len(cameras), device=means.device)
+    planes = None if lenses or len(means) <= most else _planes(rotation, offset, intrinsics)
+    for part in _chunks(means, most, boxed=planes is not None):
         local = (means[part].double() - origin).to(means)
-        near = _may_see(planes, offset, local)
-        near[[*lenses]] = True
-        near = near.nonzero()[:, 0]
+        if planes is not None:
+            near = _may_see(planes, offset, local).nonzero()[:, 0]
         if not len(near):
             continue
         fx, fy, cx, cy, width, height, focal = intrinsics[near].T
@@ -167,18 +167,16 @@ def rates_in_chunks(
         visible = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
         visible &= _inside(y.div_(z).mul_(fy).add_(cy), height)
         rates = torch.where(visible, focal / z, 0.0)
-        for column, i in enumerate(near.tolist() if lenses else ()):
-            if (camera := lenses.get(i)) is not None:
-                places, depths, sampled, _ = sights(means[part], camera)
-                inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
-                rates[:, column] = torch.where((depths > NEAR) & inside, sampled, 0.0)
+        for i, camera in lenses.items():
+            places, depths, sampled, _ = sights(means[part], camera)
+            inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
+            rates[:, i] = torch.where((depths > NEAR) & inside, sampled, 0.0)
         yield part, near, rates
 
 
-def _chunks(means: Float[Tensor, "n 3"], cameras: int, boxed: bool) -> Iterator[slice | Int[Tensor, " c"]]:
-    """Chunks of the Gaussians; boxed: many lie near each other in each, so that few cameras see any of them."""
-    most = max(1, CHUNK_PAIRS // cameras)
-    if not boxed or len(means) <= most:
+def _chunks(means: Float[Tensor, "n 3"], most: int, boxed: bool) -> Iterator[slice | Int[Tensor, " c"]]:
+    """Chunks of at most so many; boxed: of Gaussians that lie near each other, so that few cameras see any of them."""
+    if not boxed:
         yield from (slice(start, start + most) for start in range(0, len(means), most))
         return
     for some in torch.arange(len(means), device=means.device).split(BOX * BOXES):
