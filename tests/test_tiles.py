@@ -9,7 +9,7 @@ from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers.reference import Reference
-from aaplug.rasterizers.tiled import Tiled, forward
+from aaplug.rasterizers.tiled import Tiled, binning, forward
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_splats
 
@@ -100,3 +100,14 @@ def test_selected_splats_are_those_of_the_rows_and_pass_gradients_on(rows):
         assert getattr(found, name).equal(column[index])
     (grad,) = torch.autograd.grad(found.means.sum() + 0 * splats.means.sum(), splats.means)
     assert grad.equal(torch.zeros(9, 2, dtype=F64).index_fill(0, index, 1.0))
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32], ids=str)
+@pytest.mark.parametrize("count", [0, 1, binning.MIN_PADDED - 1, binning.MIN_PADDED, binning.SORTED_BY_DIGITS - 1])
+def test_lists_that_are_padded_sort_as_those_that_are_not(count, dtype):
+    keys = torch.randint(-50, 50, (count,), generator=torch.Generator().manual_seed(0)).to(dtype)
+    keys[::7] = torch.iinfo(dtype).max  # as the padding
+    values, order = binning.stably_sorted(keys)
+    expected = torch.sort(keys, stable=True)
+    assert torch.equal(values, expected.values)
+    assert torch.equal(order, expected.indices)

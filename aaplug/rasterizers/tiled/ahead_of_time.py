@@ -115,6 +115,9 @@ THIS_PROCESSOR = "native"  # as g++ calls its architecture
 # They follow the architecture, the only setting whose text reaches g++.
 SCHEDULING = ("-fschedule-insns", "-fschedule-insns -fsched-pressure")
 MANY_REGISTERS = "AVX512"  # 32 of vectors; without it there are 16, and g++ has to count them wherever it schedules
+# For Intel's processors g++ copies vectors of 512 bits by halves. A load of the whole then waits until both have left
+# the processor's store buffer, and a pass takes three times as long.
+WHOLE_VECTORS = "-mprefer-vector-width=512"
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
 TRIED = "tried "  # before a library's hash in its mark: a process is loading it for the first time, or died of that
@@ -189,7 +192,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
 
     target: None for this processor and compiler.
     """
-    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, FOR_PROFILERS, SCHEDULING, MANY_REGISTERS)
+    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, FOR_PROFILERS, SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS)
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
     facts = (torch.__version__, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
@@ -488,11 +491,12 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     if x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
         capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
-        within_registers = kernel.keeps_sums or capability != MANY_REGISTERS
-        march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[within_registers]}"
+        wide = capability == MANY_REGISTERS
+        march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[kernel.keeps_sums or not wide]}"
+        march += f" {WHOLE_VECTORS}" if wide else ""
         configs |= {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
         where_known |= {TRIED_OUT: True} if MAYBE_TOO_NEW not in _processor() else {}
-        where_known |= {PRECOMPILES: False} if kernel.keeps_sums and capability == MANY_REGISTERS else {}
+        where_known |= {PRECOMPILES: False} if kernel.keeps_sums and wide else {}
     elif target is not None:
         raise UsageError("bundle", f"needs {STANDARD_COMPILER} and a torch that tells it the architecture")
     known = torch._inductor.list_options()

@@ -80,10 +80,10 @@ class _Composite(torch.autograd.Function):
         """
         (rows,), (bins, segments, how) = ctx.saved_tensors, ctx.rest
         count = sum(len(before) for segment in segments for before in segment.before)
-        zero = all(bound == 0 for grad in grads for bound in grad.aminmax())  # as of channels that no loss reads
+        rgb, alpha = (grad.contiguous() for grad in grads)  # once: they are gathered for each segment
+        zero = all(bound == 0 for grad in (rgb, alpha) for bound in grad.aminmax())  # as of channels that no loss reads
         if zero or not count:
             return torch.zeros_like(rows), None, None
-        rgb, alpha = (grad.contiguous() for grad in grads)  # once: they are gathered for each segment
         local, kernel = how.centres(rows), step_kernel(how.pixel, how.channels)
         columns, limits = sums_per_splat(how.pixel, how.channels), rows.new_tensor(Limits.by(how.rules))
         parts = rows.new_empty(count + 1, STEP * columns)

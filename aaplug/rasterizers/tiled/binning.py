@@ -29,6 +29,9 @@ MEMORY_BYTES = 1e9
 PAIR_BYTES = 64  # bytes per candidate pair while a band is binned, measured
 MAX_PAIRS = 1 << 30  # in a band, so that they are counted by 32 bit integers
 MAX_SHORT_TILES = torch.iinfo(torch.int16).max  # tiles in a band, so that they are sorted by few bits
+SORTED_BY_DIGITS = 1 << 15  # integers from which torch sorts by their digits, and not by comparing them
+MIN_PADDED = 1 << 13  # integers from which it pays to pad them to as many
+HAS_DIGITS = "fbgemm" in torch.backends.quantized.supported_engines  # the library that sorts so
 CUTOFF_SLACK = 1e-4  # relative margin of the squared cut-off, so that float32 rounding never drops a pixel above it
 
 
@@ -97,8 +100,22 @@ def bands(
 
 def _sorted(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
     """The order of depths; the bits of positive floats sort like the floats, and integers sort faster."""
-    keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
-    return torch.sort(keys, stable=True).indices
+    if depths.dtype == torch.float32:
+        return stably_sorted(depths.contiguous().view(torch.int32))[1]
+    return torch.sort(depths, stable=True).indices
+
+
+def stably_sorted(keys: Int[Tensor, " m"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """Integers in ascending order, and where each stood; equal ones keep their order.
+
+    The largest integer pads what torch would sort by comparing: 30,000 are sorted in a fifth of the time.
+    """
+    count, padded = len(keys), keys
+    if HAS_DIGITS and MIN_PADDED <= count < SORTED_BY_DIGITS:
+        padded = keys.new_full((SORTED_BY_DIGITS,), torch.iinfo(keys.dtype).max)
+        padded[:count] = keys
+    values, order = torch.sort(padded, stable=True)
+    return values[:count], order[:count]
 
 
 def _table_rows(
@@ -165,7 +182,7 @@ def _bin(
     tile = torch.arange(size, device=order.device)
     origins = (torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE).to(boxes.table)
     by_ray = _by_ray(drawn, splats, origins, tiles)
-    by_tile, pairs = torch.sort(tiles if by_ray is None else tiles.index_select(0, by_ray), stable=True)
+    by_tile, pairs = stably_sorted(tiles if by_ray is None else tiles.index_select(0, by_ray))
     pairs = pairs if by_ray is None else by_ray.index_select(0, pairs)
     lists = splats.index_select(0, pairs) if len(pairs) else splats.new_zeros(1)
     ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
