@@ -112,8 +112,9 @@ class _Composite(torch.autograd.Function):
                 lights, whole_lights = lights[::-1], whole_lights[::-1]
                 # Among the fewest tiles one may have no splats left: its step is none of the list.
                 these = mine + step
-                ends = lists[:, 1] - step * STEP
-                steps_done.append(these if n > MIN_TILES else torch.where(lists[:, 0] < ends, these, total))
+                if n <= MIN_TILES:
+                    these = torch.where(lists[:, 0] < lists[:, 1] - step * STEP, these, total)
+                steps_done.append(these)
                 done += n
             light.index_copy_(0, segment.tiles, whole_lights[0])
         # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
