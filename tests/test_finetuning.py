@@ -291,22 +291,18 @@ def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stoppe
     job = replace(make_job(settings=replace(SETTINGS, averaged=averaged)), method=method)
     whole = begin(job)
     assert run(job, whole, every=2)
-    first, kept = begin(job), []
+    first = begin(job)
 
     def keep(state):
         save(tmp_path / "run.pt", job, state)
-        kept.append(state.good)
 
     assert not run(job, first, every=2, keep=keep, stop=lambda: first.step == stopped_at)
     again = load(tmp_path / "run.pt", job)
     assert again.step == stopped_at
-    assert again.good["step"] == 2
     assert run(job, again, every=2, keep=keep)
     assert (again.step, again.curve) == (whole.step, whole.curve)
     for name, leaf in again.leaves.items():
         assert torch.equal(leaf, whole.leaves[name]), name
-    dc = [good["leaves"]["dc"] for good in kept]
-    assert not torch.equal(dc[0], dc[-1])  # later steps do not change a copy
 
 
 def spoil(monkeypatch, bad_steps: set[int]) -> None:
@@ -336,17 +332,15 @@ def test_a_step_without_a_finite_gradient_changes_nothing(monkeypatch):
     assert (state.step, state.bad_steps, len(state.curve)) == (5, 0, 4)
 
 
-def test_after_three_bad_steps_a_run_rolls_back_and_says_so(monkeypatch):
-    job, said = make_job(settings=replace(WITHOUT_SAME, steps=8, averaged=0.7)), []
-    spoil(monkeypatch, {3, 4, 5})
+def test_a_run_ends_where_no_step_has_a_finite_gradient(monkeypatch):
+    job = make_job(settings=replace(WITHOUT_SAME, steps=8))
+    monkeypatch.setattr(loop, "MAX_BAD_STEPS", 3)
+    spoil(monkeypatch, {1, 2, 4, 5})
     state = begin(job)
-    assert run(job, state, every=2, say=said.append)
-    assert said == ["step 6: 3 steps without a finite gradient; back to step 2, at half the learning rates"]
-    assert (state.step, state.rollbacks, state.averaged) == (8, 1, 2), "steps before the rollback are not in the mean"
-    assert [entry["step"] for entry in state.curve] == [1, 2, 7, 8]
-    spoil(monkeypatch, set(range(100)))
-    monkeypatch.setattr(loop, "MAX_ROLLBACKS", 1)
-    with pytest.raises(UsageError, match="no finite gradient"):
+    assert run(job, state)
+    assert [entry["step"] for entry in state.curve] == [1, 4, 7, 8]
+    spoil(monkeypatch, {0, 3, 4, 5})
+    with pytest.raises(UsageError, match="no finite gradient at step 6, nor at the 2 before"):
         run(job, begin(job))
 
 
@@ -358,7 +352,7 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         with pytest.raises(FormatError, match="damaged"):
             load(tmp_path / "damaged.pt", job)
     torch.save(torch.load(path) | {"version": 1}, tmp_path / "old.pt")
-    said = "another version: expected aaplug finetune 9, got aaplug finetune 1; start again with `overwrite`"
+    said = "another version: expected aaplug finetune 10, got aaplug finetune 1; start again with `overwrite`"
     with pytest.raises(FormatError, match=said):
         load(tmp_path / "old.pt", job)
     with pytest.raises(UsageError, match="steps changed from 6 to 13; repeat that run, or start again with"):

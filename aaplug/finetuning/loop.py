@@ -16,7 +16,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.finetuning import LOSSES
 from aaplug.finetuning.parameters import extent, least_log_scales
 from aaplug.finetuning.settings import SEED_STRIDE, Settings
-from aaplug.finetuning.state import State, TuningJob, snapshot, state_of
+from aaplug.finetuning.state import State, TuningJob
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import PlugInError, UsageError
@@ -24,9 +24,7 @@ from aaplug.system.plug_ins import asked, blaming
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
 MAX_LOGIT = 9.0  # largest opacity logit: opacity 0.9999, where the sigmoid's gradient is nearly 0
-MAX_BAD_STEPS = 3  # consecutive steps without finite gradients before the run rolls back
-BACK_OFF = 0.5  # factor on all learning rates per rollback
-MAX_ROLLBACKS = 5
+MAX_BAD_STEPS = 18  # consecutive steps without finite gradients that end a run
 SCALE_SEED = 3_000_000  # added for the scale of a step
 
 
@@ -37,33 +35,24 @@ def run(
     every: int = 100,
     keep: Callable[[State], None] = lambda state: None,
     stop: Callable[[], bool] = lambda: False,
-    say: Callable[[str], None] = lambda text: None,
 ) -> bool:
     """Step until the job is done or `stop()` is true; return True if it is done.
 
     state: where to begin; changed in place.
     every: steps between calls of `keep`, which is also called when the run stops.
-    stop: asked before every step.  say: called when the run rolls back.
+    stop: asked before every step.
 
-    Raises UsageError if no step has a finite gradient, at any learning rate, or the loss breaks its interface.
+    Raises UsageError if many steps in turn have no finite gradient, or the loss breaks its interface.
     """
-    state.good = state.good or snapshot(state)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
         _average(job.settings, state)
-        if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
-            step, rollbacks = state.step, state.rollbacks + 1
-            if rollbacks > MAX_ROLLBACKS:
-                problem = f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks"
-                raise UsageError("finetune", problem)
-            vars(state).update(vars(state_of(state.good, job, state.good)))
-            state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
-            back = f"back to step {state.good['step']}, at half the learning rates"
-            say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
-        if state.step % every == 0 and not state.bad_steps:
-            state.good = snapshot(state)
+        if state.bad_steps >= MAX_BAD_STEPS:
+            problem = f"has no finite gradient at step {state.step}, nor at the {MAX_BAD_STEPS - 1} before"
+            raise UsageError("finetune", f"{problem}; a lower `learning_rate` may help")
+        if state.step % every == 0:
             keep(state)
-    if state.step % every or state.bad_steps:
+    if state.step % every:
         keep(state)
     return state.step >= job.settings.steps
 
@@ -89,7 +78,7 @@ def advance(job: TuningJob, state: State) -> None:
             return
         state.bad_steps = 0
         state.curve.append({"step": state.step, "view": view.name, "loss": losses})
-        decay = settings.decay ** (state.step / settings.steps) * BACK_OFF**state.rollbacks
+        decay = settings.decay ** (state.step / settings.steps)
         for group in state.adam.param_groups:
             size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
             group["lr"] = settings.rates[group["name"]] * size * decay

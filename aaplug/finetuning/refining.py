@@ -148,7 +148,7 @@ def _tuned(job: TuningJob, monitor: Monitor) -> Gaussians:
             tell(state.step, steps)
             return False
 
-        run(job, state, every=steps, stop=stop, say=monitor.say)
+        run(job, state, every=steps, stop=stop)
     return state.scene(job)
 
 

@@ -64,7 +64,7 @@ def tune(
             tell(state.step, steps)
             return interrupted()
 
-        done = run(job, state, every=every, keep=keep, stop=stop, say=monitor.say)
+        done = run(job, state, every=every, keep=keep, stop=stop)
         if done:
             tell(steps, steps)
     if not done:

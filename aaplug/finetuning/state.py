@@ -6,8 +6,7 @@ tensors, numbers and strings only, and is read as such: nothing in it is execute
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -33,7 +32,7 @@ from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
-FORMAT, VERSION = "aaplug finetune", 9  # of a checkpoint
+FORMAT, VERSION = "aaplug finetune", 10  # of a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +84,7 @@ class State:
     averages: means of the leaves over the last steps, by name.  averaged: number of these steps.
     group: places of the Gaussians that train and are drawn; None for all.
     bad_steps: consecutive steps without finite gradients.
-    rollbacks: how often the run returned to an earlier state.
     curve: number, view and loss by scale of each step.  probes: PSNR measured on the way.
-    good: snapshot of the state to return to; empty before the first step.
     """
 
     step: int
@@ -100,10 +97,8 @@ class State:
     averaged: int = 0
     group: Int[Tensor, " k"] | None = None
     bad_steps: int = 0
-    rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
     probes: list[dict[str, Any]] = field(default_factory=list)
-    good: Mapping[str, Any] = field(default_factory=dict)
 
     def scene(self, job: TuningJob) -> Gaussians:
         """The scene as it is now."""
@@ -148,26 +143,12 @@ def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
     return torch.optim.Adam(groups, eps=EPSILON)
 
 
-def snapshot(state: State) -> dict[str, Any]:
-    """A copy of the state but for `good`, which later steps do not change, in types that a file can hold."""
-    leaves = {name: leaf.detach() for name, leaf in state.leaves.items()}
-    parts = {"leaves": leaves, "adam": state.adam.state_dict(), "bounds": vars(state.bounds)}
-    return deepcopy({name: parts.get(name, value) for name, value in vars(state).items() if name != "good"})
-
-
-def state_of(data: Mapping[str, Any], job: TuningJob, good: Mapping[str, Any]) -> State:
-    """The state of a snapshot; they share no tensor.  good: see `State`."""
-    values = deepcopy(dict(data))
-    adam = optimizer(values["leaves"], job.settings)
-    adam.load_state_dict(values["adam"])
-    return State(**values | {"adam": adam, "bounds": SamplingBounds(**values["bounds"])}, good=good)
-
-
 def save(path: Path, job: TuningJob, state: State) -> None:
     """Write the state; if that fails, an older checkpoint is still whole."""
-    facts = {"format": FORMAT, "version": VERSION, "job": job.facts}
+    leaves = {name: leaf.detach() for name, leaf in state.leaves.items()}
+    values = vars(state) | {"leaves": leaves, "adam": state.adam.state_dict(), "bounds": vars(state.bounds)}
     with replacing(path, overwrite=True) as stream:
-        torch.save(facts | {"state": snapshot(state), "good": dict(state.good)}, stream)
+        torch.save({"format": FORMAT, "version": VERSION, "job": job.facts, "state": values}, stream)
 
 
 def load(path: Path, job: TuningJob) -> State:
@@ -185,7 +166,10 @@ def load(path: Path, job: TuningJob) -> State:
             if (before := content["job"].get(key)) != value:
                 problem = f"is of another run: {key} changed from {printable(str(before))} to {value}"
                 raise UsageError(str(path), f"{problem}; repeat that run, or {START_AGAIN}")
-        return state_of(content["state"], job, content["good"])
+        values = content["state"]
+        adam = optimizer(values["leaves"], job.settings)
+        adam.load_state_dict(values["adam"])
+        return State(**values | {"adam": adam, "bounds": SamplingBounds(**values["bounds"])})
     except AaplugError:
         raise
     except Exception as error:  # torch raises all kinds over a damaged file
