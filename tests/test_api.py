@@ -57,15 +57,6 @@ def test_the_default_device_of_a_program_changes_nothing(cli, monkeypatch):
 def test_an_option_that_is_none_is_refused_with_the_nearest_name():
     with pytest.raises(UsageError, match="scal: is no option here; did you mean scale"):
         aaplug.render("scene.ply", scal=0.5)
-
-
-def test_a_name_that_is_gone_is_refused_with_what_takes_its_place():
-    with pytest.raises(UsageError, match="target: is no option here; it is gone, use `viewer`"):
-        aaplug.finetune("scene.ply", target="spark")  # pyright: ignore[reportCallIssue]
-    with pytest.raises(UsageError, match=r"drop_bad: .*; it is gone, use read_scene\(path, drop_bad=True\)"):
-        aaplug.render("scene.ply", drop_bad=True)  # pyright: ignore[reportCallIssue]
-    with pytest.raises(AttributeError, match="attribute open_scene; it is gone, use read_scene"):
-        aaplug.open_scene  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(AttributeError, match=r"attribute read_scenes; did you mean read_scene\?"):
         aaplug.read_scenes  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 

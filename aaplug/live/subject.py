@@ -21,7 +21,7 @@ from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError
-from aaplug.system.shells import command_line
+from aaplug.system.extras import command_line
 
 MAX_RENDERERS = 6  # in memory: a recipe with a world filter has Gaussians of its own
 MAX_PREVIEW_GAUSSIANS = 400_000  # that are drawn while the camera moves

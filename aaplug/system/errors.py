@@ -22,18 +22,6 @@ VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
 FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)  # what a full disk is, or a limit on files
-GONE = {  # options, verbs and functions of version 0.2, in CHANGELOG.md too; each with what takes its place
-    "densify_every": "`method` mipmap-gs",
-    "drop_bad": "read_scene(path, drop_bad=True)",
-    "forward_only": "fewer `repeats`",
-    "gather": "evaluate with --scheduler",
-    "keep": "`resume`",
-    "multi_scale": "in_one_scene, see `aaplug guide levels`",
-    "open_scene": "read_scene",
-    "read_pyramid": "read_scene",
-    "shard": "`scheduler`",
-    "target": "`viewer`",
-}
 
 
 class AaplugError(Exception):
@@ -92,17 +80,12 @@ def counted(number: int, noun: str) -> str:
 def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
     """Message for a value that is none of these: ends with the one that is like it, or `otherwise`."""
     known = list(names)
-    return f"'{name}' is not one of {', '.join(known)}" + (_like(str(name), known) or otherwise)
+    return f"'{name}' is not one of {', '.join(known)}" + (did_you_mean(str(name), known) or otherwise)
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """The end of a message about an unknown option, verb or function: what takes its place, or the one like it."""
-    instead = GONE.get(name.strip("-").replace("-", "_"))
-    return f"; it is gone, use {instead}" if instead else _like(name, list(names))
-
-
-def _like(name: str, names: Sequence[str]) -> str:
-    matches = difflib.get_close_matches(name, names, 1)
+    """The end of a message about an unknown name: the one like it, if any."""
+    matches = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {matches[0]}?" if matches else ""
 
 

@@ -2,13 +2,16 @@
 
 import importlib.util
 import json
+import os
+import shlex
+import subprocess
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from aaplug.system.errors import UsageError
-from aaplug.system.shells import command_line
 
 
 def check_installed(package: str, extra: str, where: str, problem: str) -> None:
@@ -33,3 +36,8 @@ def install_command(extra: str) -> str:
         case _:
             wanted = (f"aaplug[{extra}]",)
     return command_line(("pip", "install", *wanted))
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Words as one line to copy into a shell of this system."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
