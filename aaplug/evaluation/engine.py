@@ -294,14 +294,8 @@ class ViewMeasurer:
 
     def __getstate__(self) -> dict[str, Any]:
         """The work without the scenes' files, which may be open, and with absolute paths."""
-        scenes: dict[int, Gaussians] = {}  # renderers that share a scene go on to share it
-
-        def portable(renderer: Renderer) -> Renderer:
-            scene = scenes.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))
-            return replace(renderer, scene=scene, source=None)
-
-        renderers = {name: portable(renderer) for name, renderer in self.task.renderers.items()}
-        truth = replace(self.task.truth, renderer=portable(self.task.truth.renderer))
+        renderers = {name: renderer.portable() for name, renderer in self.task.renderers.items()}
+        truth = replace(self.task.truth, renderer=self.task.truth.renderer.portable())
         views = [view if view.photo is None else replace(view, photo=view.photo.absolute()) for view in self.task.views]
         images = self.images and replace(self.images, folder=self.images.folder.absolute())
         return {"task": replace(self.task, renderers=renderers, truth=truth, views=views), "images": images}
@@ -313,4 +307,5 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
     fine, samples = renderer.sampled(camera)
     sampling = *renderer.sampling(camera), renderer.coarsening(fine, samples)
-    return id(renderer.scene), id(renderer.training), method, sampling, renderer.background, renderer.rasterizer.name
+    scene = *map(id, renderer.scene.columns.values()), id(renderer.training)
+    return scene, method, sampling, renderer.background, renderer.rasterizer.name

@@ -11,7 +11,7 @@ Where scenes are compared, ground truth is one of them, the reference, as its ow
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
 import torch
@@ -114,8 +114,7 @@ class ViewTruth:
 
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
-        self._references: dict[float, TimedImage] = {}
-        self._motions: dict[float, list[Image]] = {}
+        self.reference, self.motion = cache(self._reference), cache(self._motion)
 
     def camera(self, scale: float) -> Camera:
         """The view at a scale."""
@@ -177,22 +176,17 @@ class ViewTruth:
         """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
 
-    def reference(self, scale: float) -> TimedImage:
+    def _reference(self, scale: float) -> TimedImage:
         """The reference at a scale."""
-        if scale not in self._references:
-            self._references[scale] = self.truth.timed(self.camera(scale))
-        return self._references[scale]
+        return self.truth.timed(self.camera(scale))
 
-    def motion(self, scale: float) -> list[Image]:
+    def _motion(self, scale: float) -> list[Image]:
         """Frames that move by 1/4 px of this scale: of the reference, or of training-size renders, then resampled."""
-        if scale not in self._motions:
-            camera, timed, resized = self.camera(scale), self.truth.timed, self.truth.protocol.resized
-            if self.truth.source == "reference":
-                self._motions[scale] = timed.motion(camera, self.reference(scale))
-            else:
-                frames = timed.motion(self.view, self.look, scale)
-                self._motions[scale] = [resized(frame, camera, scale) for frame in frames]
-        return self._motions[scale]
+        camera, timed = self.camera(scale), self.truth.timed
+        if self.truth.source == "reference":
+            return timed.motion(camera, self.reference(scale))
+        frames = timed.motion(self.view, self.look, scale)
+        return [self.truth.protocol.resized(frame, camera, scale) for frame in frames]
 
     @cached_property
     def _photograph(self) -> Photograph:
