@@ -5,7 +5,6 @@ import resource
 import subprocess
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 from aaplug_cli.verbs import VERBS
@@ -15,7 +14,6 @@ from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settin
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError
-from aaplug.system.extras import install_command
 from aaplug.system.registry import REGISTRIES, _at, names_of
 from tests.conftest import run_python
 from tests.test_options import REFUSED
@@ -99,18 +97,3 @@ def test_a_recipe_that_python_registers_can_be_named(monkeypatch):
     monkeypatch.setattr(RECIPES, "_entries", dict(RECIPES))
     RECIPES.register("mine", replace(RECIPES["mip"], name="mine"))
     assert RenderOptions(recipe="mine").recipe == "mine"
-
-
-ORIGINS = [
-    (None, "pip install 'aaplug[view]'"),
-    ("no JSON", "pip install 'aaplug[view]'"),
-    ('{"url": "file:///home/a%20b/aaplug", "dir_info": {"editable": true}}', "pip install -e '/home/a b/aaplug[view]'"),
-    ('{"url": "file:///home/aaplug", "dir_info": {}}', "pip install 'aaplug[view] @ file:///home/aaplug'"),
-]
-
-
-@pytest.mark.parametrize(("origin", "command"), ORIGINS)
-def test_the_command_that_adds_an_extra_is_that_of_the_installation(monkeypatch, origin, command):
-    installed = SimpleNamespace(read_text=lambda name: origin if name == "direct_url.json" else None)
-    monkeypatch.setattr("aaplug.system.extras.distribution", lambda name: installed)
-    assert install_command("view") == command

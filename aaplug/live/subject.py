@@ -1,6 +1,9 @@
 """The subject: a scene, the views to stand in, and its renderers by recipe and quality."""
 
 import math
+import os
+import shlex
+import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +24,6 @@ from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError
-from aaplug.system.extras import command_line
 
 MAX_RENDERERS = 6  # in memory: a recipe with a world filter has Gaussians of its own
 MAX_PREVIEW_GAUSSIANS = 400_000  # that are drawn while the camera moves
@@ -101,7 +103,7 @@ class Subject:
         training = {id(view) for view in self.cameras.train}
         return {
             "title": self.title,
-            "words": command_line(self.words),
+            "words": (subprocess.list2cmdline if os.name == "nt" else shlex.join)([*self.words]),
             "gaussians": len(self.look.scene),
             "rasterizer": self.look.rasterizer.name,
             "assumed": self.cameras.assumed,

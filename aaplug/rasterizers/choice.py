@@ -54,7 +54,7 @@ def find_rasterizer(
         raise UsageError("rasterizer", not_one_of(name, ["auto", "compiled", *RASTERIZERS]))
     if name == "auto" and frames is None:
         return Tiled(OnDemandKernels())
-    kernels = load()
+    kernels, problem = load(), ""
     pays = frames is not None and frames >= (STEPS_THAT_PAY if gradients else FRAMES_THAT_PAY) and has_compiler()
     lacks_gradients = gradients and not all(map(is_built, KERNELS))
     if (name == "compiled" or pays) and (kernels is None or lacks_gradients):
@@ -63,18 +63,16 @@ def find_rasterizer(
             kernels = build(gradients=gradients)
         except UsageError as error:
             kernels = load()
-            if kernels is None:
-                if name == "compiled":
-                    raise
-                say(f"rasterizer: eager ({error})")
-                return RASTERIZERS["eager"]
-            say(f"rasterizer: some kernels run eagerly, and slower ({error})")
+            if kernels is None and name == "compiled":
+                raise
+            problem = str(error)
     if kernels is not None:
-        say("rasterizer: compiled")
+        say(f"rasterizer: some kernels run eagerly, and slower ({problem})" if problem else "rasterizer: compiled")
         return Tiled(kernels)
-    hint = "`aaplug warmup` compiles it, several times as fast"
-    hint = hint if has_compiler() else "no C++ compiler found to compile it"
-    if bundle := os.environ.get(BUNDLE_VARIABLE):
-        hint = f"{BUNDLE_VARIABLE} names {bundle}, which has no kernels for this torch and processor; {hint}"
-    say(f"rasterizer: eager ({hint})")
+    if not problem:
+        problem = "`aaplug warmup` compiles it, several times as fast"
+        problem = problem if has_compiler() else "no C++ compiler found to compile it"
+        if bundle := os.environ.get(BUNDLE_VARIABLE):
+            problem = f"{BUNDLE_VARIABLE} names {bundle}, which has no kernels for this torch and processor; {problem}"
+    say(f"rasterizer: eager ({problem})")
     return RASTERIZERS["eager"]
