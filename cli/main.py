@@ -3,7 +3,6 @@
 Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carried out, 130 interrupted.
 """
 
-import errno
 import gc
 import json
 import os
@@ -13,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from textwrap import fill
-from typing import TextIO
 
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
@@ -27,13 +25,10 @@ DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting sc
   aaplug convert scene.ply --cameras path/to/colmap -o converted.ply
   aaplug VERB --help"""
 PLOTS_FOLDER = "MPLCONFIGDIR"  # of the environment; matplotlib sets it to a temporary folder if home is read-only
-READER_GONE = (errno.EPIPE, errno.EINVAL)  # what writing to a pipe that nobody reads meets; the latter on Windows
-UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the program and exit."""
-    sys.stdout, sys.stderr = (stream or _nowhere() for stream in (sys.stdout, sys.stderr))  # closed: `>&-`
     try:
         sys.exit(_guarded(list(sys.argv[1:] if words is None else words)))
     except KeyboardInterrupt:
@@ -41,12 +36,10 @@ def main(words: Sequence[str] | None = None) -> None:
             print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
-        of_output = error.filename is None and error.errno in UNWRITABLE
-        if of_output:  # the disk is full; flush nothing at exit
-            _drop_output()
+        _drop_output()  # where the disk is full, nothing can be flushed at exit
         if isinstance(error, BrokenPipeError):  # of the log
             sys.exit(FAILED)
-        where = error.filename or ("output" if of_output else f"unexpected {type(error).__name__}")
+        where = error.filename or f"unexpected {type(error).__name__}"
         print(f"error: {printable(f'{where}: {reason(error)}')}", file=sys.stderr)
         sys.exit(REFUSED)
 
@@ -64,8 +57,8 @@ def program() -> None:
         if made and made != given:
             shutil.rmtree(made, ignore_errors=True)
         with suppress(OSError):  # its reader has gone
-            sys.stdout.flush()
-            sys.stderr.flush()
+            print(end="", flush=True)  # unlike `flush`, also where the caller has closed stdout
+            print(end="", file=sys.stderr, flush=True)
         os._exit(end.code if isinstance(end.code, int) else FAILED if end.code else 0)
 
 
@@ -76,20 +69,15 @@ def _printing(code: int = 0) -> Iterator[None]:
         try:
             yield
         finally:
-            sys.stdout.flush()
-    except OSError as error:
-        if error.errno not in READER_GONE:
-            raise
+            print(end="", flush=True)
+    except BrokenPipeError:
         _drop_output()
         sys.exit(code)
 
 
-def _nowhere() -> TextIO:
-    return os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
-
-
 def _drop_output() -> None:
-    with _nowhere() as nowhere:
+    """Write what stdout still holds nowhere."""
+    with suppress(OSError), open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 

@@ -124,9 +124,9 @@ def test_a_spz_is_read_as_fits_the_cameras(few, sample_cameras, tmp_path: Path, 
     assert torch.equal(chosen.gaussians().sh, expected.sh)
 
 
-def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sample_scene, sample_cameras, caplog):
+def test_of_two_readings_each_is_decoded_once_and_what_is_left_out_is_said_once(sample_scene, sample_cameras, caplog):
     scene = replace(sample_scene[torch.arange(3000)], origin=None)  # a copy: the sample is shared
-    scene.means[0], scene.sh[1] = torch.nan, 1e5
+    scene.means[0] = torch.nan
     decoded = []
 
     def reading(turned: bool, **other) -> Scene:
@@ -142,7 +142,7 @@ def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sampl
         assert caplog.messages == []
         assert torch.equal(chosen.gaussians().means, scene.means[1:])
     assert sorted(decoded) == [False, True]
-    assert [("left out" in said, "a harmonic beyond" in said) for said in caplog.messages] == [(0, 1), (1, 0)]
+    assert ["left out" in said for said in caplog.messages] == [True]
     assert chosen.other is None
 
 

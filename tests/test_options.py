@@ -63,16 +63,19 @@ def test_every_number_has_a_range(group, name, specs):
     (spec,) = specs
     span = spec.takes.removesuffix(" ...").rpartition("each ")[2].removeprefix("a whole number ")
     least, most = map(float, span.split(".."))
-    several = spec.count is None
+
+    def given(value: Any) -> Any:
+        return value if spec.count else [value] * (spec.length or 1)
+
     for value in NO_NUMBERS:
         inside = isinstance(value, (int, float)) and value is not True and least <= value <= most
-        assert fits(spec, [value] if several else value) == inside, value
+        assert fits(spec, given(value)) == inside, value
     default = next(field.default for field in dataclasses.fields(group) if field.name == name)
     assert default is None or fits(spec, default)
     plain = get_type_hints(group)[name]
     value = 10**30 if int in (plain, *get_args(plain)) else math.nan
     with pytest.raises(UsageError, match=rf"takes .*\.\..*, got {value}"):
-        group(**{name: [value] if several else value})
+        group(**{name: given(value)})
 
 
 REFUSED = {
@@ -102,7 +105,7 @@ REFUSED = {
     "video s.ply -o v.mp4 --path a.json --views b": "--views: is for the paths zoom, dolly, orbit, not for a.json",
     "lod s.ply -o l.ply --steps 3 --no-refine": "--steps: are of tuning, which --no-refine leaves out",
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
-    "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",
+    "convert s.ply -o c.ply --for gsplat --variance 0.1": "--variance: is set by --for; give one of the two",
     "finetune s.ply -o t.ply --learn-filters --method group-training": "is a method of its own, beside group-training",
     "render s.ply -o out --orbit 2.5": "--orbit: takes a whole number 1..10000, got 2.5",
     "render s.ply -o out --up z": "--up: takes X Y Z, each -10000000..10000000, got z",

@@ -5,26 +5,29 @@ asks for a picture as a file, {"pick": ...} for the depth of what a place of the
 announces a scene file, whose bytes follow in binary messages.  None names a file of this machine.
 """
 
-import json
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
 
 from aaplug.core.cameras import check_rigid
 from aaplug.core.colours import Colour
 from aaplug.io.images import colour_of
+from aaplug.io.values import Entry, Place, entries, focal, natural, number, numbers, parse_json
+from aaplug.io.values import text as printable_text
 from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
+from aaplug.system.errors import UsageError
 
 KINDS = ("see", "still", "pick", "open", "shown")
 MAX_MESSAGE_BYTES = 65_536
 MAX_SIDE = 8192  # px of a picture
 MAX_PIXELS = 1 << 25  # of a picture
-MAX_DISTANCE = 1e9  # world units, and px of a focal length
-MAX_ID = 2**53  # a page counts in float64
+MESSAGE = Path("message")  # that errors name
+NUMBERED = partial(natural, most=2**53)  # a page counts in float64
+SIDE = partial(natural, most=MAX_SIDE, least=1, unit=" of px")
+COLOUR = re.compile("#[0-9a-f]{6}")
 FILE_NAME = r"[^./\\:][^/\\:]*"  # on any system
 MAX_NAME_BYTES = 255
 POSE_NUMBERS = 16  # row by row
@@ -103,96 +106,66 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
 
-    Raises UsageError if it is none of ours.
+    Raises FormatError if it is none of ours, and UsageError for an empty file or a pose that is no rigid motion.
     """
-    if not isinstance(text, str):
-        raise UsageError("message", "takes text, got bytes")
-    try:
-        message = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UsageError("message", "is not JSON") from error
-    if not isinstance(message, dict) or len(message) != 1 or next(iter(message)) not in KINDS:
-        raise UsageError("message", f"takes one of {', '.join(KINDS)}")
-    [(kind, body)] = message.items()
+    message = parse_json(text if isinstance(text, bytes) else text.encode(), MESSAGE)
+    place = Place(MESSAGE, "it")
+    right = isinstance(message, dict) and len(message) == 1 and message.keys() <= {*KINDS}
+    place.expect(right, "it", f"one of {', '.join(KINDS)}", message)
+    [kind] = message
+    whole = Entry(place, message)
     if kind == "shown":
-        return Receipt(_whole(message, "shown", 0, MAX_ID))
-    if not isinstance(body, dict):
-        raise UsageError(kind, f"takes an object, got {_short(body)}")
+        return Receipt(whole.get("shown", NUMBERED))
+    body = whole.entry(kind)
     if kind == "open":
-        name = body.get("name")
-        if not isinstance(name, str) or not _is_file_name(name):
-            raise UsageError("name", f"takes the name of a scene file, got {_short(name)}")
-        size = _whole(body, "size", 0, MAX_ID)
+        name = body.get("name", printable_text)
+        right = bool(re.fullmatch(FILE_NAME, name)) and len(name.encode()) <= MAX_NAME_BYTES
+        body.place.expect(right, "name", "the name of a scene file", name)
+        size = body.get("size", NUMBERED)
         if not size:
             raise UsageError(name, "is empty")
         return OpenRequest(name, size)
     if kind == "pick":
-        return PickRequest(_number(body, "x", 0.0, 1.0), _number(body, "y", 0.0, 1.0))
-    width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))
-    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-        raise UsageError("size", f"is {width}x{height} px; the limit is {MAX_SIDE} a side and {MAX_PIXELS:,} in all")
+        return PickRequest(body.get("x", _share), body.get("y", _share))
+    width, height = (body.get(side, SIDE) for side in ("width", "height"))
+    body.place.expect(width * height <= MAX_PIXELS, "size", f"at most {MAX_PIXELS:,} px", f"{width}x{height}")
     if kind == "still":
-        return StillRequest(width, height, _whole(body, "side", 0, 1))
-    sides = body.get("sides")
-    if not isinstance(sides, list) or len(sides) != 2 or not all(isinstance(side, dict) for side in sides):
-        raise UsageError("sides", f"takes two objects, got {_short(sides)}")
-    colour = body.get("background")
-    if colour is not None and not (isinstance(colour, str) and re.fullmatch("#[0-9a-f]{6}", colour)):
-        raise UsageError("background", f"takes #rrggbb, got {_short(colour)}")
-    left, right = (Side(_name(side, "recipe", recipes), _name(side, "quality", QUALITIES)) for side in sides)
+        return StillRequest(width, height, body.get("side", partial(natural, most=1)))
+    sides = entries(MESSAGE, "side", body.value("sides"))
+    body.place.expect(len(sides) == 2, "sides", "two", len(sides))
+    left, right = (
+        Side(side.get("recipe", _one_of(recipes)), side.get("quality", _one_of(QUALITIES))) for side in sides
+    )
+    given = {key for key, value in body.fields.items() if value is not None}
+    colour = body.get("background", printable_text) if "background" in given else None
+    body.place.expect(colour is None or bool(COLOUR.fullmatch(colour)), "background", "#rrggbb", colour)
+    pose = tuple(numbers(body.value("pose"), POSE_NUMBERS, body.place, "pose"))
+    check_rigid([pose[row : row + 4] for row in range(0, POSE_NUMBERS, 4)])
     return PictureRequest(
-        id=_whole(body, "id", 0, MAX_ID),
-        pose=_pose(body),
-        focal=_number(body, "focal", 1e-3, MAX_DISTANCE),
+        id=body.get("id", NUMBERED),
+        pose=pose,
+        focal=body.get("focal", focal),
         width=width,
         height=height,
-        split=_number(body, "split", 0.0, 1.0),
+        split=body.get("split", _share),
         sides=(left, right),
-        at=None if body.get("at") is None else _whole(body, "at", 0, cameras - 1),
-        moving=body.get("moving") is True,
-        overlay=None if body.get("paint") is None else _name(body, "paint", OVERLAYS),
-        photo=body.get("photo") is True,
+        at=body.get("at", partial(natural, most=cameras - 1)) if "at" in given else None,
+        moving=body.fields.get("moving") is True,
+        overlay=body.get("paint", _one_of(OVERLAYS)) if "paint" in given else None,
+        photo=body.fields.get("photo") is True,
         background=None if colour is None else colour_of(colour),
     )
 
 
-def _pose(body: Mapping[str, Any]) -> tuple[float, ...]:
-    """The numbers of a rigid motion, row by row."""
-    pose = body.get("pose")
-    if not isinstance(pose, list) or len(pose) != POSE_NUMBERS:
-        raise UsageError("pose", f"takes {POSE_NUMBERS} numbers, got {_short(pose)}")
-    numbers = tuple(_number({"pose": x}, "pose", -MAX_DISTANCE, MAX_DISTANCE) for x in pose)
-    try:
-        check_rigid([numbers[row : row + 4] for row in range(0, POSE_NUMBERS, 4)])
-    except UsageError as error:
-        raise UsageError("pose", "takes a rotation and a translation, row by row") from error
-    return numbers
+def _share(value: object, place: Place, field: str) -> float:
+    real = number(value, place, field)
+    place.expect(0 <= real <= 1, field, "from 0 to 1", value)
+    return real
 
 
-def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> float:
-    value = body.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise UsageError(name, f"takes a number from {least:g} to {most:g}, got {_short(value)}")
-    return float(value)
+def _one_of(names: Collection[str]) -> Callable[[object, Place, str], str]:
+    def check(value: object, place: Place, field: str) -> str:
+        place.expect(value in list(names), field, f"one of {', '.join(names)}", value)
+        return str(value)
 
-
-def _is_file_name(name: str) -> bool:
-    return bool(re.fullmatch(FILE_NAME, name)) and name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES
-
-
-def _whole(body: Mapping[str, Any], name: str, least: int, most: int) -> int:
-    value = _number(body, name, float(least), float(most))
-    if value != math.floor(value):
-        raise UsageError(name, f"takes a whole number, got {_short(body[name])}")
-    return int(value)
-
-
-def _name(body: Mapping[str, Any], name: str, choices: Sequence[str] | Mapping[str, Any]) -> str:
-    value = body.get(name)
-    if not isinstance(value, str) or value not in choices:
-        raise UsageError(name, not_one_of(str(value)[:MAX_VALUE_CHARACTERS], choices))
-    return value
-
-
-def _short(value: object) -> str:
-    return str(value)[:MAX_VALUE_CHARACTERS] or "nothing"
+    return check

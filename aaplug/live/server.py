@@ -76,9 +76,7 @@ class Server:
         except (OSError, UnicodeError) as error:
             self._thread.join()
             code = None if isinstance(error, socket.gaierror | UnicodeError) else error.errno
-            told = getattr(socket, "errorTab", {}).get(code)  # Windows' words, which its strerror does not have
-            # asyncio's own words name the address once more
-            why = (told or strerror(code)).lower().rstrip(".") if code else reason(error)
+            why = strerror(code).lower() if code else reason(error)  # asyncio's own words name the address once more
             if code in (None, EADDRNOTAVAIL):
                 raise UsageError("host", f"{self._host} cannot be used: {why}") from error
             raise UsageError("port", f"{self._port} of {self._host} cannot be used: {why}") from error

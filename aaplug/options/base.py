@@ -72,18 +72,21 @@ class Argument:
 
 @dataclass(frozen=True, kw_only=True)
 class Number(Argument):
-    """Takes a number from `least` to `most`, an integer if `whole`; or one or more of them."""
+    """Takes a number from `least` to `most`, an integer if `whole`; or one or more of them, or `length`."""
 
     least: Bound
     most: Bound
     whole: bool
+    length: int | None = None
 
     def check(self, option: str, value: Any) -> None:
         """Refuse what is no number, or outside of the range."""
         values = [value] if self.count else value
-        if value is None or (isinstance(values, (list, tuple)) and values and all(map(self._holds, values))):
-            return
         listed = isinstance(values, (list, tuple))
+        if value is None or (
+            listed and all(map(self._holds, values)) and len(values) == (self.length or len(values) or 1)
+        ):
+            return
         got = ", ".join(map(str, values)) if listed else str(value)
         takes = self.takes if listed else f"a list or tuple of {self.takes.removesuffix(' ...')}"
         raise UsageError(option, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
@@ -158,11 +161,12 @@ def number(
     several: bool = False,
     unit: str = "",
     metavar: str = "",
+    length: int | None = None,
 ) -> Number:
     """An option that takes a number, or one or more.
 
     A number that need not be whole may be written as 1/4 or 25%.  unit: may follow it as the word's end.
-    metavar: stands for the value in `--help` instead of the range.
+    metavar: stands for the value in `--help` instead of the range.  length: how many numbers, None for any.
     """
 
     def real(word: str) -> float:
@@ -177,7 +181,7 @@ def number(
     named = f"{metavar}, each " * bool(several and metavar)  # such as X Y Z
     takes = f"{named}{'a whole number ' * whole}{span}" + " ..." * (several and not named)
     how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "whole": whole}
-    return Number(metavar=shown, least=least, most=most, **how)
+    return Number(metavar=shown, least=least, most=most, length=length, **how)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,6 +201,12 @@ class Options:
             if argument is not None:
                 argument.check(name, value)
         check_fields(self)
+
+    def need(self, holds: bool, problem: str, *names: str) -> None:
+        """Refuse options that are not as usual, unless a condition holds; raises UsageError."""
+        for name in names:
+            if not holds and getattr(self, name) != getattr(type(self), name):
+                raise UsageError(name, problem)
 
 
 def argument_of(annotation: Any) -> Argument | None:

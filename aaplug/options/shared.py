@@ -45,7 +45,7 @@ MAX_COORDINATE = 1e7  # world units
 DEFAULT_FOV = 50.0  # degrees
 DEFAULT_SENSOR = 0.036  # scene units: 36 mm, the width of full frame, where a scene unit is a metre
 
-_PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
+_PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z", length=3)
 
 OneRecipe = Annotated[str | Recipe, names(kind="recipe", metavar=RECIPE_METAVAR)]
 OneViewer = Annotated[str | Viewer | None, names(kind="viewer", metavar="VIEWER", flags=("--for",))]
@@ -158,8 +158,7 @@ class ImageOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.scale is not None and self.resolution is not None:
-            raise UsageError("scale", "sets the size, as `resolution` does; give one")
+        self.need(self.resolution is None, "sets the size, as `resolution` does; give one", "scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,18 +182,12 @@ class FilmOptions(RecipeOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.focus_at is not None and len(self.focus_at) != 3:
-            raise UsageError("focus_at", f"takes three numbers X Y Z, got {len(self.focus_at)}")
-        if self.focus_distance is not None and self.focus_at is not None:
-            raise UsageError("focus_distance", "sets the focus, as `focus_at` does; give one")
-        if self.f_stop is not None and self.focus_distance is None and self.focus_at is None:
-            raise UsageError("f_stop", "is an aperture without focus; give `focus_distance` or `focus_at`")
-        for name in ("sensor", "focus_distance", "focus_at", "blades"):
-            if self.f_stop is None and getattr(self, name) is not None:
-                raise UsageError(name, "belongs to `f_stop`")
-        for name in ("f_stop", "shutter"):
-            if self.samples == 0 and getattr(self, name) is not None:
-                raise UsageError(name, "is ignored by `samples` of 0; give one of the two")
+        self.need(self.focus_at is None, "sets the focus, as `focus_at` does; give one", "focus_distance")
+        focused = self.focus_distance is not None or self.focus_at is not None
+        self.need(focused, "is an aperture without focus; give `focus_distance` or `focus_at`", "f_stop")
+        of_aperture = ("sensor", "focus_distance", "focus_at", "blades")
+        self.need(self.f_stop is not None, "belongs to `f_stop`", *of_aperture)
+        self.need(self.samples != 0, "is ignored by `samples` of 0; give one of the two", "f_stop", "shutter")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,8 +205,8 @@ class LensOptions(Options):
         super().__post_init__()
         if (self.eye_distance is None) == (self.lens == "vr180"):
             raise UsageError("eye_distance", "belongs to lens vr180, which needs it: about 0.064 m in scene units")
-        if self.lens_angle != HALF_TURN and self.lens not in ("fisheye", "equisolid"):
-            raise UsageError("lens_angle", "belongs to lenses fisheye and equisolid; name one as `lens`")
+        has_angle = self.lens in ("fisheye", "equisolid")
+        self.need(has_angle, "belongs to lenses fisheye and equisolid; name one as `lens`", "lens_angle")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,12 +232,5 @@ class Orbit(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("look_at", "eye", "up"):
-            value = getattr(self, name)
-            if value is not None and len(value) != 3:
-                raise UsageError(name, f"takes three numbers X Y Z, got {len(value)}")
-        if self.train_view is not None and self.train_rate is not None:
-            raise UsageError("train_view", "sets the training rate, as `train_rate` does; give one")
-        for name in ("orbit", "elevation"):
-            if self.eye is not None and getattr(self, name) is not None:
-                raise UsageError("eye", f"is a single place, which `{name}` would change; give one")
+        self.need(self.train_rate is None, "sets the training rate, as `train_rate` does; give one", "train_view")
+        self.need(self.eye is None, "moves the camera along an orbit, and `eye` is one place", "orbit", "elevation")

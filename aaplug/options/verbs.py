@@ -81,10 +81,8 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.path is not None and self.views != RenderOptions.views:
-            raise UsageError("views", "are replaced by `path`; give one of the two")
-        if self.samples == 0 and self.camera_to is not None:
-            raise UsageError("camera_to", "opens a shutter, which `samples` of 0 ignores; give one of the two")
+        self.need(self.path is None, "are replaced by `path`; give one of the two", "views")
+        self.need(self.samples != 0, "opens a shutter, which `samples` of 0 ignores; give one of the two", "camera_to")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,10 +108,8 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("start", "end", "seconds", "views"):
-            paths = RECEDING_PATHS if name in ("start", "end") else BUILT_IN_PATHS
-            if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
-                raise UsageError(name, f"is for the paths {listing(paths)}, not for {self.path}")
+        for paths, of_them in ((RECEDING_PATHS, ("start", "end")), (BUILT_IN_PATHS, ("seconds", "views"))):
+            self.need(str(self.path) in paths, f"is for the paths {listing(paths)}, not for {self.path}", *of_them)
         if str(self.path) == "zoom" and self.lens not in (None, "pinhole", "ortho"):
             problem = f"{self.lens} sets its own angle, which zoom would change; give `path` dolly or orbit"
             raise UsageError("lens", problem)
@@ -154,8 +150,7 @@ class EvaluateOptions(RecipeOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.show != EvaluateOptions.show and not self.report:
-            raise UsageError("show", "selects views of the report; give `report`, too")
+        self.need(self.report, "selects views of the report; give `report`, too", "show")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,8 +176,7 @@ class CompareOptions(RecipeOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.viewer is not None and self.recipe != "auto":
-            raise UsageError("viewer", "sets the recipe itself; leave out `recipe`")
+        self.need(self.viewer is None, "is set by `viewer`; give one of the two", "recipe")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,10 +196,8 @@ class ConvertOptions(WritingOptions, ViewOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.viewer is not None and (self.form is not None or self.variance is not None):
-            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
-        if self.viewer is None and self.steps is not None:
-            raise UsageError("steps", "belongs to the fit to a viewer; name one with `viewer`")
+        self.need(self.viewer is None, "is set by `viewer`; give one of the two", "form", "variance")
+        self.need(self.viewer is not None, "belongs to the fit to a viewer; name one with `viewer`", "steps")
 
 
 IN_TIME = (RenderOptions, VideoOptions, EvaluateOptions, ConvertOptions)  # of the verbs that take a scene in time
@@ -260,22 +252,15 @@ class LodOptions(WritingOptions, ViewOptions):
         given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
-        if self.scale is not None and not self.single:
-            raise UsageError("scale", "belongs to `simplify` and `budget`")
+        self.need(self.single, "belongs to `simplify` and `budget`", "scale")
         if self.simplify is not None and self.simplify > 1 and self.simplify % 1:
             raise UsageError("simplify", f"above 1 is a count: expected a whole number, got {self.simplify:g}")
-        if self.merge_below and self.single:
-            raise UsageError("merge_below", "belongs to levels")
-        if self.to is not None and self.single:
-            raise UsageError("to", "belongs to levels")
-        if self.page is not None and self.to is None:
-            raise UsageError("page", "belongs to `to`")
-        if self.resume and (self.single or (self.viewer is not None and self.to is None)):
-            raise UsageError("resume", "belongs to levels for aaplug, and to `to`")
-        if self.viewer is not None and not self.tuning:
-            raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
-        if self.steps is not None and not self.refine:
-            raise UsageError("steps", "are of tuning, which `refine` leaves out")
+        self.need(not self.single, "belongs to levels", "merge_below", "to")
+        self.need(self.to is not None, "belongs to `to`", "page")
+        resumable = not self.single and (self.viewer is None or self.to is not None)
+        self.need(resumable, "belongs to levels for aaplug, and to `to`", "resume")
+        self.need(self.tuning > 0, "is what the result is tuned for: leave out `refine`, and `steps` of 0", "viewer")
+        self.need(self.refine, "are of tuning, which `refine` leaves out", "steps")
 
     @property
     def single(self) -> bool:
@@ -328,8 +313,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.learn_filters and self.method != USUAL_METHOD:
-            raise UsageError("learn_filters", f"is a method of its own, beside {self.method}")
+        self.need(self.method == USUAL_METHOD, f"is a method of its own, beside {self.method}", "learn_filters")
 
 
 @dataclass(frozen=True, kw_only=True)

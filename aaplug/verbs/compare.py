@@ -49,7 +49,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
 
     Raises:
         FrameError: a scene is turned, scaled or moved against the first, and `any_frame` is false.
-        AaplugError: as `render`; also, there are fewer than two scenes, or one is named twice.
+        AaplugError: as `render`; also, there are fewer than two scenes.
     """
     folder, viewer = None if output is None else Path(output), find_viewer(options.viewer)
     check = partial(check_compared, folder, options.resume, options.overwrite, options.show)
@@ -110,24 +110,16 @@ def check_compared(folder: Path | None, resume: bool, overwrite: bool, show: str
 
 
 def _named(scenes: ScenesLike) -> dict[str, Scene]:
-    """The scenes by name, opened; without names they get those of their files."""
+    """The scenes by name, opened; without names they get those of their files, numbered where two are the same."""
     opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if len(opened) < 2:
         problem = f"needs two scenes or more, got {len(opened)}; the others are compared with the first"
         raise UsageError("compare", problem)
     if isinstance(scenes, Mapping):
         return dict(zip(scenes, opened, strict=True))
-    files = [scene.file for scene in opened]
-    for file in filter(None, files[1:]):
-        if files[1:].count(file) > 1:
-            problem = "is named twice; a scene is compared once (with itself, if it is the first too)"
-            raise UsageError(str(file), problem)
-    names = [f"scene {place}" if scene.file is None else scene.title for place, scene in enumerate(opened)]
-    if len(set(names)) < len({file or place for place, file in enumerate(files)}):
-        pairs = zip(names, files, strict=True)
-        names = [name if file is None else f"{file.parent.name}/{name}" for name, file in pairs]
-    again = [place > 0 and file is not None and file == files[0] for place, file in enumerate(files)]
-    names = [name + " again" * same for name, same in zip(names, again, strict=True)]
+    titles = [scene.title for scene in opened]
+    longer = [f"{s.file.parent.name}/{name}" if s.file else name for name, s in zip(titles, opened, strict=True)]
+    names = longer if len(set(titles)) < len(set(longer)) == len(longer) else titles
     return dict(zip(file_names(names, "scene", 1), opened, strict=True))
 
 

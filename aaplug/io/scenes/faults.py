@@ -1,4 +1,4 @@
-"""Values of Gaussians that no renderer can use, and values that were hardly meant."""
+"""Values of Gaussians that no renderer can use."""
 
 from collections.abc import Mapping
 
@@ -11,8 +11,6 @@ from aaplug.io.scenes.columns import FILTER_COLUMN, matrix_of
 from aaplug.system.errors import UsageError, listing
 
 SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
-HUGE_LOG_SCALE = 20.0  # half a billion units
-HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
 
 
 def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
@@ -54,18 +52,3 @@ def check_values(scene: Gaussians) -> None:
     """Refuse Gaussians in memory that no renderer can use."""
     if faults := faults_of(scene):
         raise UsageError(scene.name, f"{described_faults(faults)}; leave such Gaussians out")
-
-
-def doubts_of(scene: Gaussians) -> dict[str, int]:
-    """Values that renderers can use but that were hardly meant, and their number of rows."""
-    if not len(scene):
-        return {}
-    doubts = dict[str, int]()
-    if scene.log_scales.max() > HUGE_LOG_SCALE:
-        rows = (scene.log_scales > HUGE_LOG_SCALE).any(dim=1)
-        doubts[f"a log-scale above {HUGE_LOG_SCALE:g}, a size that no view shows"] = int(rows.sum())
-    low, high = scene.sh.aminmax()
-    if max(-low, high) > HUGE_HARMONIC:
-        rows = (scene.sh.abs() > HUGE_HARMONIC).flatten(1).any(dim=1)
-        doubts[f"a harmonic beyond {HUGE_HARMONIC:g}, a colour far out of range"] = int(rows.sum())
-    return doubts

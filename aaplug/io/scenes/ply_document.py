@@ -20,8 +20,6 @@ from aaplug.io.scenes.rows import read_rows
 from aaplug.io.values import read_part
 from aaplug.system.errors import FormatError
 
-MAX_SPREAD = 16  # rows spread over more than this many times their number are read one by one
-
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -46,14 +44,12 @@ class Table:
 
     def take(self, rows: Tensor) -> np.ndarray:
         """The rows with these indices."""
-        if len(rows) == 0:
-            return np.empty(0, self.dtype)
-        first, last = int(rows.min()), int(rows.max())
-        if self.parsed is None and last - first > MAX_SPREAD * len(rows):
+        table = self.parsed
+        if table is None:
             self._check_unchanged()
-            table = np.memmap(self.path, self.dtype, "r", self.offset, (self.count,))
-            return np.array(table[rows.numpy()])
-        return self.read(first, last + 1)[(rows - first).numpy()]
+            shape = (max(1, self.count),)  # none cannot be mapped
+            table = np.memmap(self.path, self.dtype, "r", self.offset, shape) if self.count else np.empty(0, self.dtype)
+        return np.array(table[rows.numpy()])
 
     def _check_unchanged(self) -> None:
         if stamp_of(self.path) != self.stamp:

@@ -6,7 +6,6 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 
 import logging
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,7 +26,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io import STREAM_INDEXES
 from aaplug.io.cameras import read_cameras, recognized
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of, usable
+from aaplug.io.scenes.faults import check_values, described_faults, faults_of, usable
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.digests import digest_of_values
@@ -232,7 +231,7 @@ class Scene:
             FormatError: a row cannot be used, and neither `drop_bad` nor `faults` asks to leave it out.
         """
         dropped: dict[str, int] = {} if faults is None else faults
-        left_out, doubts = 0, Counter[str]()
+        left_out = 0
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
             if self.path is None:
@@ -246,10 +245,7 @@ class Scene:
                     dropped[text] = dropped.get(text, 0) + int(rows.sum())
                 good = usable(part)
                 left_out, part = left_out + len(part) - len(good), good
-            doubts.update(doubts_of(part))
             yield part
-        for text, number in doubts.items():
-            log.warning("%s: %d of %d Gaussians have %s", self.name, number, self.count, text)
         if left_out and faults is None:
             counts = listing([f"{text}: {number:,}" for text, number in dropped.items()])
             log.warning("%s: left out %d of %d Gaussians (%s)", self.name, left_out, self.count, counts)
