@@ -12,8 +12,6 @@ from aaplug.verbs.info import info
 from tests.conftest import make_scene
 from tests.test_cli import break_nan, inria_model
 
-BOTH_MODES = b"comment SplatRenderMode: mip\ncomment SplatRenderMode: default\nelement vertex"
-
 
 def test_info_with_cameras_tells_the_sampling_as_data_on_stdout_beside_a_log_on_stderr(cli):
     facts = info("scene.ply", ".")
@@ -59,7 +57,6 @@ def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
     [
         ("scales", "exponentiated"),
         ("opacities", "activated"),
-        ("tags", "contradict"),
         ("filter", "aaplug convert"),
         ("discs", "as discs"),
         ("far", "from the origin"),
@@ -77,8 +74,6 @@ def test_info_names_problems(tmp_path: Path, kind: str, words: str):
     }
     path = tmp_path / "in.ply"
     write_scene(path, replace(scene, **changed.get(kind, {})))
-    if kind == "tags":
-        path.write_bytes(path.read_bytes().replace(b"element vertex", BOTH_MODES, 1))
     (problem,) = info(path)["problems"]
     assert words in problem
 

@@ -234,7 +234,7 @@ def test_halves_and_both_axes_of_usd_are_read(tmp_path: Path, up: str):
 
 def test_a_usd_core_that_does_not_know_splats_is_refused(tmp_path: Path, monkeypatch):
     pytest.importorskip("pxr")
-    from aaplug.io.scenes import usd_child
+    from aaplug.io import usd_child
 
     monkeypatch.setattr(usd_child.UsdGeom, "Xformable", lambda prim: None)  # as of a prim without a place
     assert "usd-core 26.3" in usd_child.found_in(str(stage(tmp_path, oracle())), {})["refused"]

@@ -123,7 +123,15 @@ def merge_in_chunks(
 
         places = order[slice(*ends)]
         batch = scene[places]
-        return _merge_batch(clusters_of(batch, rates[places], chunks[places], visible[places]), batch, goal, tell_batch)
+        clusters = clusters_of(batch, rates[places], chunks[places], visible[places])
+        result = rounds(clusters, goal, tell_batch)
+        lighter, placed, parents = gaussians_of(result, batch, clusters.weights), result.chunks, result.labels
+        if goal.count is None:  # without hidden ones, which are not counted
+            stays = ~_hidden(lighter, result, goal.rate)
+            shown = stays.nonzero()[:, 0]
+            lighter, placed, parents = lighter[shown], placed[shown], (stays.cumsum(0) - 1)[parents]
+        tell_batch(len(batch))
+        return lighter, placed, parents
 
     workers = min(given_threads(), len(stops) - 1)
     batches = (Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))
@@ -161,18 +169,6 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
             if is_last:
                 break
     return clusters
-
-
-def _merge_batch(clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Batch:
-    """The lighter scene of one batch, without hidden Gaussians unless their count is the goal."""
-    result = rounds(clusters, goal, tell)
-    lighter, chunks, parents = gaussians_of(result, scene, clusters.weights), result.chunks, result.labels
-    if goal.count is None:
-        stays = ~_hidden(lighter, result, goal.rate)
-        visible = stays.nonzero()[:, 0]
-        lighter, chunks, parents = lighter[visible], chunks[visible], (stays.cumsum(0) - 1)[parents]
-    tell(len(scene))
-    return lighter, chunks, parents
 
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:

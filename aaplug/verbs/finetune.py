@@ -166,13 +166,16 @@ def _beside(scene: Path, kind: str) -> Path:
 
 @contextmanager
 def _resumable(checkpoint: Path | None, resumes: bool, monitor: Monitor) -> Iterator[None]:
-    """Say, where Ctrl-C ends the block, that its checkpoint continues; one of a run that this one replaces goes."""
-    if checkpoint is not None and not resumes:
-        checkpoint.unlink(missing_ok=True)
+    """Say, where Ctrl-C ends the block, that its checkpoint continues: not one of a run that this one replaces."""
+
+    def written() -> int | None:
+        return checkpoint.stat().st_mtime_ns if checkpoint is not None and checkpoint.exists() else None
+
+    before = None if resumes else written()
     try:
         yield
     except KeyboardInterrupt:
-        if checkpoint is not None and checkpoint.exists():
+        if written() not in (None, before):
             monitor.say(f"{checkpoint} is kept; --resume continues")
         raise
 

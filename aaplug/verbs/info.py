@@ -1,7 +1,7 @@
 """Facts of a scene: its convention and why, what is fused, what is odd."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
@@ -95,7 +95,7 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         }
     elif train:
         facts |= _sampling_facts(opened, statistics, job.cameras)
-    return facts | {"problems": list(_problems(opened, statistics, comments))}
+    return facts | {"problems": list(_problems(opened, statistics))}
 
 
 def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dic
     }
 
 
-def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iterator[str]:
+def _problems(scene: Scene, statistics: Survey) -> Iterator[str]:
     """Yield what is odd about the scene, each with what to do."""
     for text, number in statistics.faults.items():
         yield f"{counted(number, 'Gaussian')} with {text}: --drop-bad leaves such out"
@@ -138,6 +138,3 @@ def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iter
     extent = (statistics.high - statistics.low).max().item()
     if 0 < extent < MIN_STEPS * ULP * farthest:
         yield f"lies {farthest:.3g} from the origin, where float32 is coarse: centre it before training"
-    modes = [c for c in comments if c.lower().startswith("splatrendermode")]
-    if len({mode.lower() for mode in modes}) > 1:
-        yield f"its comments contradict each other ({'; '.join(modes)}): the last one counts; --convention overrides it"

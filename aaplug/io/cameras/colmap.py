@@ -38,7 +38,13 @@ def sniff(path: Path) -> bool:
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras at the size of their photos."""
     folder = _model_folder(path) or path
-    cameras_file, images_file = _files(folder)
+    pairs = [(folder / f"cameras{kind}", folder / f"images{kind}") for kind in KINDS]
+    pair = next((pair for pair in pairs if all(map(os.path.isfile, pair))), None)
+    if pair is None:
+        needs = "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt"
+        there = listing([file.name for pair in pairs for file in pair if os.path.isfile(file)])
+        raise FormatError(folder, f"{needs}; found {there or 'neither'}")
+    cameras_file, images_file = pair
     intrinsics = read_cameras(cameras_file)
     images = sorted(read_images(images_file), key=lambda image: image.name)
     root = folder.absolute()
@@ -68,16 +74,6 @@ def _model_folder(path: Path) -> Path | None:
         return path.parent if in_model else None
     tries = (path / "sparse" / "0", path / "sparse", path / "0", path)
     return next((t for t in tries if any(os.path.isfile(t / f"cameras{k}") for k in KINDS)), None)
-
-
-def _files(folder: Path) -> tuple[Path, Path]:
-    pairs = [(folder / f"cameras{kind}", folder / f"images{kind}") for kind in KINDS]
-    for pair in pairs:
-        if all(map(os.path.isfile, pair)):
-            return pair
-    there = listing([file.name for pair in pairs for file in pair if os.path.isfile(file)])
-    needs = "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt"
-    raise FormatError(folder, f"{needs}; found {there or 'neither'}")
 
 
 def _other_models(folder: Path) -> list[str]:

@@ -186,21 +186,17 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
     else:
         unknown = "its size is unknown: the file has no w and h, and there are no photos"
         raise entry.place.error(f"{unknown}; put the photos where file_path says, or add w and h (px) beside frames")
-    fx, fy, cx, cy = _intrinsics(entry, width, height)
+    if entry.get("camera_model", text, PINHOLES[0]) == PANORAMA:
+        fx, fy, cx, cy = panorama(width, height)
+    else:
+        fx, fy = _focal(entry, "x", width), _focal(entry, "y", height)
+        fx = fx or fy or entry.get("fl_x", focal)  # which is missing
+        fy, cx, cy = fy or fx, entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
     world_from_cam = pose_of_opengl(rigid(entry, "transform_matrix"), entry.place, "transform_matrix")
     if parser is not None:
         world_from_cam = parser[0] @ world_from_cam
         world_from_cam[:3, 3] *= parser[1]
     return Camera(name, width, height, fx, fy, cx, cy, inverse(world_from_cam), photo=photo)
-
-
-def _intrinsics(entry: Entry, width: int, height: int) -> tuple[float, float, float, float]:
-    """fx, fy, cx and cy, in px; those of a panorama follow from its size."""
-    if entry.get("camera_model", text, PINHOLES[0]) == PANORAMA:
-        return panorama(width, height)
-    fx, fy = _focal(entry, "x", width), _focal(entry, "y", height)
-    fx = fx or fy or entry.get("fl_x", focal)  # which is missing
-    return fx, fy or fx, entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
 
 
 def _focal(entry: Entry, axis: str, side: int) -> float | None:

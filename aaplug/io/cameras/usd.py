@@ -75,35 +75,16 @@ def module(name: str) -> Any:
 
 def _check_layers(path: Path) -> None:
     """Refuse layers outside of the file's folder, whoever names them."""
-    Sdf, home, left, seen = module("Sdf"), path.parent.resolve(), [str(path)], set[str]()
-    while left:
-        layer = Sdf.Layer.FindOrOpen(left.pop())
-        if layer is None:
-            raise FormatError(path, "cannot be read: it is no USD, or a layer that it names is missing")
-        if _has_clips(layer):
-            raise FormatError(path, "has value clips, which are other layers; flatten it into one file")
-        for asset in filter(None, layer.GetCompositionAssetDependencies()):
-            name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
-            file = name.partition("[")[0]  # a package's own file stands in brackets
-            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(home):
+    from aaplug.io.usd_child import layers_of  # its package is an extra
+
+    try:
+        for number, (asset, file) in enumerate(layers_of(str(path))):
+            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(path.parent.resolve()):
                 raise FormatError(path, f"names a layer outside of its folder: {asset!r}")
-            if name not in seen:
-                seen.add(name)
-                left.append(name)
-        if len(seen) > MAX_LAYERS:
-            raise FormatError(path, f"names more than {MAX_LAYERS} layers")
-
-
-def _has_clips(layer: Any) -> bool:
-    """True if a prim has value clips: layers that no composition names, which reading a value opens."""
-    keys = list[str]()
-
-    def look(path: Any) -> None:
-        spec = layer.GetObjectAtPath(path)  # None of a relationship's target
-        keys.extend(spec.ListInfoKeys() if spec else ())
-
-    layer.Traverse(module("Sdf").Path.absoluteRootPath, look)
-    return any(key.startswith("clip") for key in keys)
+            if number >= MAX_LAYERS:
+                raise FormatError(path, f"names more than {MAX_LAYERS} layers")
+    except ValueError as error:
+        raise FormatError(path, str(error)) from error
 
 
 def _moves(camera: Any) -> bool:

@@ -259,11 +259,6 @@ class Scene:
         """Usable Gaussians from evenly spaced places, `each` at a place: enough to know where the scene is."""
         return usable(joined([self.raw(p.start, p.stop) for p in probes(self.count, each)] or [self.raw(0, 0)]))
 
-    @property
-    def harmonics_bytes(self) -> int:
-        """Bytes that the harmonics take in memory."""
-        return memory_of(self.count, self.sh_degree) - memory_of(self.count)
-
     def check_memory(self, harmonics: bool = True) -> None:
         """Refuse a scene above the limit MEMORY_SHARE of the machine's memory, with or without harmonics."""
         needed = memory_of(self.count, self.sh_degree) if harmonics else memory_of(self.count)
@@ -361,7 +356,8 @@ def without_harmonics(scene: Scene) -> tuple[Gaussians, Callable[[int, int], Ten
     `Scene.gaussians`.
     """
     path, in_memory = scene.path, "gaussians" in scene.memory
-    if path is None or in_memory or scene.format != "ply" or scene.harmonics_bytes <= MAX_HARMONICS_BYTES:
+    harmonics_bytes = memory_of(scene.count, scene.sh_degree) - memory_of(scene.count)
+    if path is None or in_memory or scene.format != "ply" or harmonics_bytes <= MAX_HARMONICS_BYTES:
         return scene.gaussians(), None
     if "without harmonics" not in scene.memory:
         scene.check_memory(harmonics=False)

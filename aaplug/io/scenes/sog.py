@@ -214,7 +214,11 @@ def _rows(
         sh[:, 1:] = palette[index.clamp(max=len(palette) - 1)] * (index < len(palette))[:, None, None]
     if flat:
         log_scales[:, 2] = -MAX_LOG_SCALE
-    return Gaussians(_means(means, rows), _quats(quats.pixels[0][rows]), log_scales, logits, sh)
+    turns = quats.pixels[0][rows]
+    largest = torch.from_numpy(turns[:, 3].astype(np.int64)) - W_LARGEST
+    unit = largest_last((floats(turns[:, :3]) / 255 - 0.5) * 2**0.5, largest.clamp(min=0))
+    unit = torch.where(largest[:, None] < 0, torch.tensor([1.0, 0.0, 0.0, 0.0]), unit)
+    return Gaussians(_means(means, rows), unit, log_scales, logits, sh)
 
 
 def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
@@ -226,14 +230,6 @@ def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
 
 def _unsquashed(logs: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return logs.sign() * logs.abs().expm1()
-
-
-def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
-    rest = (floats(pixels[:, :3]) / 255 - 0.5) * 2**0.5
-    valid = torch.from_numpy(pixels[:, 3] >= W_LARGEST)
-    largest = torch.from_numpy(pixels[:, 3].astype(np.int64)) - W_LARGEST
-    quats = largest_last(rest, largest.clamp(min=0))
-    return torch.where(valid[:, None], quats, torch.tensor([1.0, 0.0, 0.0, 0.0]))
 
 
 # Writing

@@ -132,7 +132,16 @@ def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | Non
             raise FormatError(path, f"version {header.version} should not be one gzip stream")
         parts, records = _streams(path, data, sizes)
     else:
-        payload = _payload(path, data, sum(sizes), zipped)
+        whole, payload = HEADER.size + sum(sizes), data
+        if zipped:
+            check_growth(path, whole, len(data))
+            slack = whole_limit("SLACK")
+            payload = zlib.decompressobj(GZIP_WINDOW).decompress(data, whole + slack + 1)
+            if len(payload) > whole + slack:  # a few bytes more are accepted
+                raise FormatError(path, f"inflates to more than {whole + slack:,} bytes, its header promises {whole:,}")
+        if len(payload) < whole:
+            raise FormatError(path, f"is cut short: {whole:,} bytes promised, {len(payload):,} there")
+        payload = payload[HEADER.size :]
         parts = (payload[start:end] for start, end in pairwise(accumulate(sizes, initial=0)))
         records = payload[sum(sizes) :]
     shaped = zip(parts, header.widths, strict=True)
@@ -166,21 +175,6 @@ def _header(path: Path, data: bytes) -> Header:
         raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
     check_count(path, count)
     return Header(version, count, degree, fraction, flags)
-
-
-def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
-    whole = HEADER.size + size
-    if zipped:
-        check_growth(path, whole, len(data))
-        slack = whole_limit("SLACK")
-        inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, whole + slack + 1)
-        if not whole <= len(inflated) <= whole + slack:  # a few bytes more are accepted
-            many = "more than " * (len(inflated) > whole + slack)
-            raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {whole:,}")
-        return inflated[HEADER.size :]
-    if len(data) < whole:
-        raise FormatError(path, f"is cut short: {whole:,} bytes promised, {len(data):,} there")
-    return data[HEADER.size :]
 
 
 def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:

@@ -1,4 +1,4 @@
-"""Reads the splats of a USD stage for `usd`, as a program of its own: usd-core ends the process at some damaged files.
+"""The layers of a USD stage, and as a program of its own its splats: usd-core ends the process at some damaged files.
 
 Words: the file, and one for the arrays.  It prints what it found as a line of JSON; "refused" says why there is
 nothing.  Nothing of aaplug is imported, so that it starts at once.
@@ -7,6 +7,7 @@ nothing.  Nothing of aaplug is imported, so that it starts at once.
 import json
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from typing import Any
@@ -30,41 +31,40 @@ def limit_memory(path: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
 
 
-def has_clips(layer: Any) -> bool:
-    """True if a prim has value clips: layers that no composition names, which reading a value opens."""
-    keys = list[str]()
+def layers_of(path: str) -> Iterator[tuple[str, str]]:
+    """The layers that a stage is composed with, as their files name them, and their files; each is opened after that.
 
-    def look(path: Any) -> None:
-        spec = layer.GetObjectAtPath(path)  # None of a relationship's target
-        keys.extend(spec.ListInfoKeys() if spec else ())
-
-    layer.Traverse(Sdf.Path.absoluteRootPath, look)
-    return any(key.startswith("clip") for key in keys)
-
-
-def foreign_layer(path: str) -> str | None:
-    """A layer that the stage is composed with, other than those of its own package; None if there is none."""
-    left, seen = [path], set[str]()
+    Raises ValueError for one that cannot be opened, and for value clips: layers that no composition names, which
+    reading a value opens.
+    """
+    left, seen, keys = [path], set[str](), list[str]()
     while left:
-        layer = Sdf.Layer.FindOrOpen(left.pop())
-        if has_clips(layer):
-            return "value clips"
+        if (layer := Sdf.Layer.FindOrOpen(left.pop())) is None:
+            raise ValueError("cannot be read: it is no USD, or a layer that it names is missing")
+
+        def look(path: Any, layer: Any = layer) -> None:
+            spec = layer.GetObjectAtPath(path)  # None of a relationship's target
+            keys.extend(spec.ListInfoKeys() if spec else ())
+
+        layer.Traverse(Sdf.Path.absoluteRootPath, look)
+        if any(key.startswith("clip") for key in keys):
+            raise ValueError("has value clips, which are other layers; flatten it into one file")
         for asset in filter(None, layer.GetCompositionAssetDependencies()):
             name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
-            file, inside, _ = name.partition("[")
-            if not inside or os.path.realpath(file) != os.path.realpath(path):
-                return asset
             if name not in seen:
                 seen.add(name)
+                yield asset, name.partition("[")[0]  # a package's own file stands in brackets
                 left.append(name)
-    return None
 
 
 def found_in(path: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The stage's facts, and each prim's; its arrays go to `arrays` by number and name."""
-    asset = foreign_layer(path)
-    if asset is not None:
-        return {"refused": f"is composed with another layer, {asset!r}; flatten it into one file"}
+    try:
+        for asset, file in layers_of(path):
+            if os.path.realpath(file) != os.path.realpath(path):
+                raise ValueError(f"is composed with another layer, {asset!r}; flatten it into one file")
+    except ValueError as error:
+        return {"refused": str(error)}
     stage, time = Usd.Stage.Open(path), Usd.TimeCode.EarliestTime()  # the default where nothing moves
     prims = [prim for prim in stage.Traverse() if str(prim.GetTypeName()) == TYPE]
     if not prims:
