@@ -154,17 +154,13 @@ def refuse(others: Mapping[str, object]) -> None:
             continue
         if name not in FIXED:
             raise UsageError(name, "is not an argument of this function of gsplat's that aaplug knows")
-        default = FIXED[name]
+        default, value = FIXED[name], value.name if isinstance(value, Enum) else value  # gsplat has one of shutters
         if isinstance(value, Tensor):
             same = name.endswith("_coeffs") and not value.any()
-        elif isinstance(value, Enum):  # gsplat has one of shutters
-            same = value.name == default
         else:
             same = value == default or not (value or default)
         if not same:
-            got = described(value.name if isinstance(value, Enum) else value)
-            words = f"only {default} is supported on the CPU, got {got}"
-            raise UsageError(name, words)
+            raise UsageError(name, f"only {default} is supported on the CPU, got {described(value)}")
 
 
 def views_of(

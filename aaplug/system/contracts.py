@@ -84,18 +84,13 @@ def contract(function: F) -> F:
     """The same function in memory and full precision; raises UsageError for an argument that does not fit its hint."""
     names = tuple(inspect.signature(function).parameters)
     terms = dict[str, Term]()  # filled when it is called first: a hint may name a class that stands below
-    in_order = list[Term]()
 
     @wraps(function)
     def checked(*args: Any, **keywords: Any) -> Any:
-        if not in_order:
+        if not terms:
             terms.update(terms_of(function))
-            in_order.extend(terms.get(name, ANYTHING) for name in names)
         sizes: Sizes = {}
-        for term, value in zip(in_order, args, strict=False):
-            if not term[0](value, sizes):
-                refuse(names[in_order.index(term)], value, term, sizes)
-        for name, value in keywords.items():
+        for name, value in (*zip(names, args, strict=False), *keywords.items()):
             if name in terms and not terms[name].holds(value, sizes):
                 refuse(name, value, terms[name], sizes)
         with in_memory(), in_full_precision():
