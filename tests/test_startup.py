@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +15,7 @@ from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settin
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.registry import REGISTRIES, _at, names_of
 from tests.conftest import run_python
 from tests.test_options import REFUSED
@@ -97,3 +99,11 @@ def test_a_recipe_that_python_registers_can_be_named(monkeypatch):
     monkeypatch.setattr(RECIPES, "_entries", dict(RECIPES))
     RECIPES.register("mine", replace(RECIPES["mip"], name="mine"))
     assert RenderOptions(recipe="mine").recipe == "mine"
+
+
+def test_the_command_for_an_extra_finds_the_installation(tmp_path):
+    """pip looks nowhere else for what is installed already, wherever that came from."""
+    pytest.importorskip("pip")
+    command = [sys.executable, "-m", *shlex.split(install_command("view")), "--no-index", "--dry-run"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "Requirement already satisfied: aaplug[view]" in done.stdout, done.stderr
