@@ -194,6 +194,31 @@ def test_a_compiler_counts_registers_where_there_are_few(counted, monkeypatch):
         assert ("-mprefer-vector-width=512" in march) == (target.capability == "AVX512")
 
 
+@linux
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        ("g++-11 (Debian 11.3.0-12) 11.3.0\nCopyright (C) 2021 Free Software Foundation, Inc.", "-fschedule-insns"),
+        ("Debian clang version 14.0.6\nTarget: x86_64-pc-linux-gnu", "-fno-trapping-math"),
+        ("Intel(R) oneAPI DPC++/C++ Compiler 2026.0.0", ""),
+    ],
+)
+def test_a_compiler_gets_its_options_whatever_its_file_is_called(words, options, monkeypatch):
+    if not hasattr(torch._inductor.config.cpp, "march"):
+        pytest.skip("this torch does not tell a compiler the architecture")
+    monkeypatch.setenv("CXX", "/opt/conda/bin/x86_64-conda-linux-gnu-c++")
+    monkeypatch.setattr(compiled, "_compiler_version", lambda compiler: words)
+    kernel, (target, *_) = forward.pass_kernel(point.POINT), compiled.TARGETS
+    march = compiled._configs(kernel).get("cpp.march", "")
+    assert march.startswith("native" if options else "")
+    assert options in march
+    if "Free" in words:
+        assert compiled._configs(kernel, target)["cpp.march"].startswith(target.name)
+    else:  # what clang compiles needs its OpenMP library, which another machine may lack
+        with pytest.raises(UsageError, match=r"bundle: needs g\+\+"):
+            compiled._configs(kernel, target)
+
+
 def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, monkeypatch):
     kernel, compared = binning.PAIRS, []
     monkeypatch.setattr(compiled, "_close", lambda *x: compared.append(x) or True)
