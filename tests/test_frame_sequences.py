@@ -31,6 +31,14 @@ def test_a_name_with_places_or_a_folder_with_a_format_is_a_sequence(cli):
     assert sorted(bytes_of("b")) == [*(f"frame.{i:04d}.jpg" for i in range(1, 7)), "frame.json"]
 
 
+def test_a_sequence_begins_at_the_number_of_its_plate(cli):
+    words = f"{WORDS} out/f.####.png --first-frame"
+    cli.done(f"{words} 1001")
+    assert [*bytes_of("out")] == [*(f"f.{i}.png" for i in range(1001, 1007)), "f.json"]
+    cli.refused(f"{words} 1003 --resume", "holds f.1001.png, f.1002.png beside the 6 frames; remove them")
+    cli.refused(f"{words} -1", "--first-frame: takes a whole number 0..")
+
+
 @pytest.mark.parametrize(
     ("names", "files"),
     [
@@ -76,6 +84,7 @@ def test_frames_of_another_request_are_not_continued(cli):
     cli.refused(f"{words} --resume", "f.json: does not exist, which says what the frames show")
     Path("out/f.json").write_text("[1]")
     cli.refused(f"{words} --resume", "f.json: is damaged; start again with --overwrite")
+    cli.refused(f"{words} --resume --overwrite", "--resume: continues a run, and --overwrite starts anew; give one")
     Path("f.json").replace("out/f.json")
     assert bytes_of("out") == before
 
@@ -85,7 +94,7 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
     cli.done(words)
     cli.refused(
         f"{words} --overwrite --seconds 0.1".replace("--seconds 0.2 ", ""),
-        "holds f.0004.png, f.0005.png, f.0006.png, which would follow the 3 frames",
+        "holds f.0004.png, f.0005.png, f.0006.png beside the 3 frames",
     )
     with monkeypatch.context() as patch:  # stopped before its first frame
         patch.setattr("aaplug.verbs.video.write_frames", lambda *args, **how: sys.exit(3))
@@ -93,7 +102,7 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
     assert sorted(bytes_of("out")) == ["f.json"]
 
 
-VIDEO = "a video holds 8-bit sRGB colours alone and is not resumed"
+VIDEO = "a video is one file of 8-bit sRGB colours, which is not resumed"
 REFUSED = {
     "v.%04d.exr": "name a .webm or .mp4 file, or frames such as name.####.png",
     "v.webm --transparent": f"--transparent: {VIDEO}; name a sequence, such as frames/frame.####.exr",
@@ -101,6 +110,7 @@ REFUSED = {
     "v.mp4 --colour linear": f"--colour: {VIDEO}",
     "v.mp4 --passes rgb,depth": f"--passes: {VIDEO}",
     "v.mp4 --bit-depth 16": f"--bit-depth: {VIDEO}",
+    "v.mp4 --first-frame 1001": f"--first-frame: {VIDEO}",
     "v.mp4 --format exr": f"--format: {VIDEO}",
     "v.mp4 --lens fisheye": "--lens: fisheye sets its own angle, which zoom would change; give --path dolly or orbit",
     "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",

@@ -57,6 +57,7 @@ RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
 BUILT_IN_PATHS = (*RECEDING_PATHS, "orbit")
 Source = Literal["auto", "self", "photographs"]  # of the truth
 Layout = Literal["plain", "inria"]
+MOST_FIRST_FRAME = 10**9
 SHOWN_VIEWS = flag("N|NAME,...")
 
 
@@ -105,6 +106,8 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     """Frames per second (default: the path file's, or 30); frames that a path file lists play at this rate."""
     resume: Annotated[bool, FILES] = False
     """Continue an interrupted frame sequence; finished frames are not drawn again."""
+    first_frame: Annotated[int, number(0, MOST_FIRST_FRAME, whole=True, metavar="N"), FILES] = 1
+    """Number of a frame sequence's first frame, such as 1001."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

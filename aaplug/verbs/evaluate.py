@@ -21,7 +21,7 @@ from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
-from aaplug.verbs.verb import writes
+from aaplug.verbs.verb import RESUME_OR_OVERWRITE, writes
 
 
 @writes(EvaluateOptions)
@@ -110,7 +110,7 @@ def check_journalled(
     asked: whether other options ask for something in the folder.
     """
     if resume and overwrite:
-        raise UsageError("resume", "continues a run, and `overwrite` starts anew; give one")
+        raise UsageError("resume", RESUME_OR_OVERWRITE)
     if folder is None:
         for option in [name for name, is_asked in (*asked.items(), ("resume", resume)) if is_asked]:
             raise UsageError(option, "needs a folder; give `output`")

@@ -1,4 +1,4 @@
-"""Frame sequences: an image file a frame, named by its number from 1, and a record by which a run continues.
+"""Frame sequences: an image file a frame, named by its number, and a record by which a run continues.
 
 A frame appears whole or not at all, so the frames that are there are done.  The record beside them, frame.json for
 frame.####.exr, holds what was asked for.
@@ -13,7 +13,8 @@ from typing import Any
 
 from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, write_file
-from aaplug.system.errors import START_AGAIN, FormatError, OutputError, counted, listing
+from aaplug.system.errors import START_AGAIN, FormatError, OutputError, UsageError, counted, listing
+from aaplug.verbs.verb import RESUME_OR_OVERWRITE
 from aaplug.verbs.views import SUFFIXES, names_image
 
 PLACES = re.compile("#+")  # of a frame's number in a name
@@ -23,10 +24,11 @@ USUAL_NAME = "frame.####"  # in a folder
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """The files of `count` frames.  pattern: their path, with # for the digits of the number."""
+    """The files of `count` frames.  pattern: their path, with # for the digits of a number, from `first`."""
 
     pattern: Path
     count: int = 0
+    first: int = 1
 
     @classmethod
     def of(cls, output: Path, format: str | None) -> "FrameSequence | None":
@@ -51,7 +53,7 @@ class FrameSequence:
     def paths(self) -> list[Path]:
         """The frames' files, in order."""
         [places] = PLACES.findall(self.pattern.name)
-        numbers = (f"{number:0{len(places)}d}" for number in range(1, self.count + 1))
+        numbers = (f"{number:0{len(places)}d}" for number in range(self.first, self.first + self.count))
         return [self.folder / PLACES.sub(number, self.pattern.name) for number in numbers]
 
     @property
@@ -62,14 +64,15 @@ class FrameSequence:
 
     def check(self, overwrite: bool, resume: bool) -> None:
         """Refuse, before any work, frames that exist unless `overwrite` or `resume` is set, and further ones."""
+        if resume and overwrite:
+            raise UsageError("resume", RESUME_OR_OVERWRITE)
         files = [*self.paths, self.record]
         before, after = PLACES.split(self.pattern.name)
         numbered = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}", re.ASCII)
         found = sorted(p.name for p in self.folder.iterdir()) if self.folder.is_dir() else []
         further = [name for name in found if numbered.fullmatch(name) and self.folder / name not in files]
         if further:
-            frames = counted(self.count, "frame")
-            problem = f"holds {listing(further, most=3)}, which would follow the {frames}; remove them"
+            problem = f"holds {listing(further, most=3)} beside the {counted(self.count, 'frame')}; remove them"
             raise OutputError(self.folder, problem)
         refuse_existing(files, overwrite, resume)
         if resume and not self.record.exists() and any(path.exists() for path in self.paths):

@@ -44,6 +44,7 @@ IN_VIDEO = {  # what a video can hold of the options of image files
     "colour": (None, "srgb"),
     "bit_depth": (None, 8),
     "resume": (False,),
+    "first_frame": (1,),
 }
 
 
@@ -73,7 +74,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     if sequence is None and target.suffix.lower() in CODECS:
         for name, held in IN_VIDEO.items():
             if getattr(options, name) not in held:
-                raise UsageError(name, f"a video holds 8-bit sRGB colours alone and is not resumed; {SEQUENCE}")
+                raise UsageError(name, f"a video is one file of 8-bit sRGB colours, which is not resumed; {SEQUENCE}")
     storage, options = storage_of(target if sequence is None else sequence.pattern, options)
     if options.lens == "vr180" and sequence is not None:
         raise UsageError("lens", "vr180 is a pair of images, of which a sequence has one: `render --path` writes both")
@@ -97,7 +98,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     if len({view.hw for view in views}) > 1:
         raise UsageError("path", f"has frames of different sizes ({sizes_of(views)} px); give `resolution`")
     if sequence is not None:
-        sequence = replace(sequence, count=len(views))
+        sequence = replace(sequence, count=len(views), first=options.first_frame)
         check = partial(sequence.check, options.overwrite, options.resume)
         check()
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
