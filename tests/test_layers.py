@@ -68,6 +68,7 @@ def test_exr_layers_come_back_bit_for_bit(tmp_path, bit_depth):
     import OpenEXR
 
     drawn = layers()
+    drawn["rgb"][0, 0] = 1e6  # above the largest finite half
     write_layers(tmp_path / "a.exr", drawn, storage("exr", *drawn, bit_depth=bit_depth))
     file = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True)
     found = {name: channel.pixels for name, channel in file.channels().items()}
@@ -75,7 +76,8 @@ def test_exr_layers_come_back_bit_for_bit(tmp_path, bit_depth):
     assert sorted(found) == sorted(" ".join(names).split())
     half = torch.float16 if bit_depth == 16 else torch.float32
     for (name, layer), channels in zip(drawn.items(), names, strict=True):
-        planes = layer.reshape(5, 7, -1).to(torch.float32 if name in ("depth", "id") else half).unbind(dim=2)
+        dtype = torch.float32 if name in ("depth", "id") else half
+        planes = layer.reshape(5, 7, -1).double().clamp(max=torch.finfo(dtype).max).to(dtype).unbind(dim=2)
         for plane, channel in zip(planes, channels.split(), strict=True):
             assert found[channel].dtype == plane.numpy().dtype, channel
             assert np.array_equal(found[channel], plane.numpy()), channel
