@@ -608,8 +608,8 @@ def test_four_channels_are_composited_together_where_their_kernels_are_built_and
 
 
 def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
-    monkeypatch.setattr(compiled, "has_compiler", lambda: False)
-    with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler"):
+    monkeypatch.setenv("CXX", "g++-99")
+    with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler .* g\+\+-99 is not here"):
         compiled.build()
 
 

@@ -319,7 +319,7 @@ def _build_all(
     tell(0)
     if left:
         if not has_compiler():
-            raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
+            raise UsageError("warmup", f"needs a C++ compiler for torch: {_compiler()} is not here; CXX names another")
         processes = min(given_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, ordered=False)
         problems: dict[str, str] = {}
