@@ -28,9 +28,23 @@ PLOTS_FOLDER = "MPLCONFIGDIR"  # of the environment; matplotlib sets it to a tem
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the program and exit."""
+    """Run the program and exit; mistakes of the user become a line on stderr and an exit code."""
+    words = list(sys.argv[1:] if words is None else words)
     try:
-        sys.exit(_guarded(list(sys.argv[1:] if words is None else words)))
+        if words == ["--version"]:
+            with _printing():
+                print(f"aaplug {version('aaplug')}")
+            sys.exit()
+        from . import console
+
+        console.set_up()
+        try:
+            sys.exit(run(words))
+        except AaplugError as error:
+            console.refuse(str(error))
+        except RecursionError:
+            console.refuse("an input is nested too deeply")
+        sys.exit(REFUSED)
     except KeyboardInterrupt:
         with suppress(OSError):  # its terminal has closed
             print("interrupted", file=sys.stderr)
@@ -79,24 +93,6 @@ def _drop_output() -> None:
     """Write what stdout still holds nowhere."""
     with suppress(OSError), open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
-
-
-def _guarded(words: Sequence[str]) -> int:
-    """Run one verb; mistakes of the user become a line on stderr and an exit code."""
-    if words == ["--version"]:
-        with _printing():
-            print(f"aaplug {version('aaplug')}")
-        return 0
-    from . import console
-
-    console.set_up()
-    try:
-        return run(words)
-    except AaplugError as error:
-        console.refuse(str(error))
-    except RecursionError:
-        console.refuse("an input is nested too deeply")
-    return REFUSED
 
 
 def run(words: Sequence[str]) -> int:

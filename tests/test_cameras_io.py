@@ -347,7 +347,7 @@ def test_a_colmap_lens_has_its_coefficients_in_order(tmp_path, write, model, coe
     assert (camera.lens, bent.lens, bent.photo) == (PINHOLE, lens, camera.photo)
     assert (camera.undistortion is None) == (lens == PINHOLE)
     assert camera.undistortion is None or camera.undistortion.lens == lens
-    distorts = f"1 camera with a lens that distorts ({MODEL_NAMES[model]})"
+    distorts = f"1 camera with another lens than a pinhole ({MODEL_NAMES[model]})"
     assert any(distorts in note for note in cameras.notes) == (lens != PINHOLE)
 
 
@@ -356,7 +356,7 @@ def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
     bent = one_camera(7, (300.0, 310.0, 200.0, 100.0, 0.9))
     cameras = read_cameras(colmap_bin(tmp_path / "sparse", *bent).parent)
     assert cameras.train[0].photo is None
-    assert "distorts (FOV): drawn as pinholes, without photos" in cameras.notes[-1]
+    assert "pinhole (FOV): drawn as pinholes, without photos" in cameras.notes[-1]
 
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
@@ -373,7 +373,9 @@ def test_a_panorama_is_taken_as_it_is(tmp_path, kind):
     (camera,) = cameras.train
     assert (camera.lens, camera.photo, camera.undistortion) == (EQUIRECT, path, None)
     assert camera.hw == (width // 2, width)
-    assert "1 camera of 360° × 180° (EQUIRECTANGULAR)" in cameras.notes[-1]
+    assert (
+        "1 camera with another lens than a pinhole (EQUIRECTANGULAR): renders are panoramas, too" in cameras.notes[-1]
+    )
     assert not any("distorts" in note for note in cameras.notes)
     right, down = torch.eye(3, dtype=torch.float64)[:2] @ camera.cam_from_world[:3, :3]
     pixels, _ = camera.project(torch.stack([camera.centre + right, camera.centre + down]))
@@ -623,7 +625,7 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
     file = write_json(tmp_path / "transforms.json", document)
     cameras = read_cameras(file, undistort=True)
     first, straight = cameras.train
-    assert f"1 camera with a lens that distorts ({name})" in cameras.notes[-1]
+    assert f"1 camera with another lens than a pinhole ({name})" in cameras.notes[-1]
     assert (straight.lens, straight.undistortion) == (PINHOLE, None)
     bent = read_cameras(file).train[0]
     if coefficients is None:

@@ -22,7 +22,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.levels import pairing
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, pair_moments, rates_of
 from aaplug.levels.covariances import area, areas, blur, covariances, overlaps
-from aaplug.levels.merging import Goal, merge, merge_in_chunks
+from aaplug.levels.merging import TOLERANCE, Goal, merge, merge_in_chunks
 from aaplug.levels.pairing import ALPHA_WEIGHT, MAX_COST, PIXEL_BLUR, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
@@ -44,8 +44,12 @@ def pair(opacity: float, apart: float, size: float = 0.2) -> Gaussians:
     return scene
 
 
+def level_goal(level: int) -> Goal:
+    return Goal(0.5**level, tolerance=TOLERANCE)
+
+
 def merged_to(count: int, scene: Gaussians, rate: float = RATE) -> Gaussians:
-    return merge(scene, torch.full((len(scene),), rate), Goal.of_count(count, scene))
+    return merge(scene, torch.full((len(scene),), rate), Goal(min(1.0, math.sqrt(count / len(scene))), count))
 
 
 def test_a_merged_pair_alone_keeps_the_integral_of_its_alpha():
@@ -183,7 +187,7 @@ def test_what_is_large_stays_and_what_is_small_is_merged():
     small.means[:] = 0.02 * small.means + 3
     small.log_scales[:] = math.log(0.002)
     scene = Gaussians(*(torch.cat([getattr(s, n) for s in (large, small)]) for n in large.columns))
-    found = merge(scene, torch.full((450,), RATE), Goal.of_level(1))
+    found = merge(scene, torch.full((450,), RATE), level_goal(1))
     near = found.means.min(dim=1).values > 2
     assert int((~near).sum()) > 45
     assert int(near.sum()) < 40
@@ -202,7 +206,7 @@ def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
     rates = rates_of(sample_scene, sample_cameras.train)
     view = sample_cameras.test[0]
     truth = Renderer.of(sample_scene, sample_cameras, quality="best", background="white")(view.scaled(1 / 8)).rgb
-    level = merge(sample_scene, rates, Goal.of_level(3))
+    level = merge(sample_scene, rates, level_goal(3))
     assert len(level) < 0.5 * len(sample_scene)
     image = Renderer.of(level, sample_cameras, background="white")(view.scaled(1 / 8)).rgb
     assert (psnr(image, truth) or 0) > 38
@@ -215,7 +219,7 @@ def test_thin_things_keep_their_contrast(level, least, blind, monkeypatch):
     """Wires 0.5 to 4 px wide close to a board; merging to the same count by distance alone loses them."""
     scene, cameras = wires_over_checkerboard()
     look, rates = Renderer.of(scene, cameras, "matched"), rates_of(scene, cameras.train)
-    found = merge(scene, rates, Goal.of_level(level))
+    found = merge(scene, rates, level_goal(level))
     assert least < contrast(look.showing(found), look, cameras.test, 2**level) < 1.1
 
     def distances(clusters, one, other, rate, most):
@@ -314,7 +318,7 @@ def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(t
     plane = rotation_matrices(pair.unit_quats)[0]
     pair = replace(pair, means=plane[:, 0] * torch.tensor([[-0.02], [0.02]]))
     solid = replace(pair, flat=False)
-    one, other = (merge(scene, torch.full((2,), 50.0), Goal.of_count(1, scene)) for scene in (pair, solid))
+    one, other = (merge(scene, torch.full((2,), 50.0), Goal(math.sqrt(1 / len(scene)), 1)) for scene in (pair, solid))
     scales = one.log_scales[0]
     assert one.flat
     assert scales[2] == -30

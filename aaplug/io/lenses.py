@@ -24,6 +24,9 @@ HALF_PIXEL = 0.5  # px: the centre of OpenCV's first pixel is 0
 MIN_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
 CACHED_LENSES = 8  # since most photographs share one
 PANORAMA = "EQUIRECTANGULAR"  # by COLMAP's and nerfstudio's name
+PANORAMIC, BENT = "renders are panoramas, too", "renders are bent as their photos are; `undistort` straightens both"
+STRAIGHTENED = "renders are of the pinhole at its centre; photos are undistorted and cropped to what they cover"
+UNUSED = "drawn as pinholes, without photos (colmap image_undistorter converts them)"
 
 
 @dataclass(frozen=True)
@@ -49,17 +52,24 @@ def with_lenses(
     Raises:
         UsageError: a panorama is to be undistorted.
     """
-    drawn = []
+    drawn, names = list[Camera](), dict[str, list[str]]()  # the names of lens models by what becomes of their cameras
     for camera, distortion in zip(cameras, distortions, strict=True):
-        if distortion is not None and not undistort:
-            camera = replace(camera, **({"lens": distortion.lens} if distortion.lens else {"photo": None}))
-        elif distortion is not None and distortion.lens == EQUIRECT:
-            problem = f"its photograph is a panorama ({distortion.name}), which no pinhole shows"
-            raise UsageError(f"camera {camera.name}", f"{problem}; leave out `undistort`")
-        elif distortion is not None:
-            camera = _straightened(camera, distortion.lens)
+        if distortion is not None:
+            lens, what = distortion.lens, PANORAMIC if distortion.lens == EQUIRECT else BENT
+            if undistort and lens == EQUIRECT:
+                problem = f"its photograph is a panorama ({distortion.name}), which no pinhole shows"
+                raise UsageError(f"camera {camera.name}", f"{problem}; leave out `undistort`")
+            if undistort:
+                camera, what = _straightened(camera, lens), STRAIGHTENED
+            else:
+                camera = replace(camera, **({"lens": lens} if lens else {"photo": None}))
+            unused = lens is None or (undistort and camera.photo is None)
+            names.setdefault(UNUSED if unused else what, []).append(distortion.name)
         drawn.append(camera)
-    return drawn, _notes(distortions, drawn, undistort)
+    return drawn, [
+        f"{counted(len(each), 'camera')} with another lens than a pinhole ({', '.join(sorted({*each}))}): {what}"
+        for what, each in names.items()
+    ]
 
 
 def _straightened(camera: Camera, lens: Lens | None) -> Camera:
@@ -84,27 +94,6 @@ def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None
     height, width = image.shape[:2]
     x, y = _maps(undistortion, width, height)
     return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def _notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], undistort: bool) -> list[str]:
-    """Notes on the panoramas and the lenses that distort, with the names of their models."""
-    both = zip(distortions, cameras, strict=True)
-    pairs = [(lens, camera) for lens, camera in both if lens and lens.name != PANORAMA]
-    panoramas = distortions.count(Distortion(PANORAMA, EQUIRECT))
-    notes = [f"{counted(panoramas, 'camera')} of 360° × 180° ({PANORAMA}), and so are the renders"] if panoramas else []
-    if not pairs:
-        return notes
-    models = ", ".join(sorted({lens.name for lens, _ in pairs}))
-    usable = sum(lens.lens is not None and (camera.photo is not None or not undistort) for lens, camera in pairs)
-    what = list[str]()
-    if usable and undistort:
-        what.append("renders are of the pinhole at its centre; photos are undistorted and cropped to what they cover")
-    elif usable:
-        what.append("renders are bent as their photos are; `undistort` straightens both")
-    if left := len(pairs) - usable:
-        count = f"{left} " * (usable > 0)
-        what.append(f"{count}drawn as pinholes, without photos (colmap image_undistorter converts them)")
-    return [*notes, f"{counted(len(pairs), 'camera')} with a lens that distorts ({models}): {'; '.join(what)}"]
 
 
 @lru_cache(CACHED_LENSES)

@@ -52,11 +52,6 @@ class Goal:
     tolerance: float = math.inf
     smallest: float = 0.0
 
-    @classmethod
-    def of_count(cls, count: int, scene: Gaussians) -> "Goal":
-        """The goal of so many Gaussians: a quarter of them is meant for half the size, as on a surface."""
-        return cls(min(1.0, math.sqrt(count / max(1, len(scene)))), count)
-
     @property
     def tolerances(self) -> Iterator[float]:
         """The tolerance of each round, in px²."""
@@ -67,11 +62,6 @@ class Goal:
             yield tolerance
             tolerance *= TOLERANCE_STEP
         yield self.tolerance
-
-    @classmethod
-    def of_level(cls, level: int, smallest: float = 0.0) -> "Goal":
-        """Level k of a pyramid, for half the size of the level before."""
-        return cls(0.5**level, tolerance=TOLERANCE, smallest=smallest)
 
 
 def merge(

@@ -55,7 +55,7 @@ class Subject:
         test = {id(camera) for camera in self.cameras.test}
         test_first = sorted(self.cameras.all, key=lambda camera: id(camera) not in test)
         self.views = spread(test_first, MAX_VIEWS)
-        self._prepared = lru_cache(MAX_RENDERERS)(self._prepare)
+        self._prepared = lru_cache(MAX_RENDERERS)(lambda s: self.look.by(find_recipe(s.recipe, quality=s.quality)))
         self._prominent = lru_cache(MAX_RENDERERS)(lambda scene: replace(scene, origin=None)[self._by_prominence])
 
     @property
@@ -143,9 +143,6 @@ class Subject:
                     left, right = (quantised(renderer(camera).rgb) for renderer in renderers)
                     best = min(best, (psnr(left, right) or math.inf, index, scale))
         return None if best[0] == math.inf else {"decibels": best[0], "view": best[1], "scale": best[2]}
-
-    def _prepare(self, side: Side) -> Renderer:
-        return self.look.by(find_recipe(side.recipe, quality=side.quality))
 
     @cached_property
     def _by_prominence(self) -> torch.Tensor:

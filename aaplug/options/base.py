@@ -196,10 +196,8 @@ class Options:
     """Receiver of messages and progress."""
 
     def __post_init__(self) -> None:
-        for name, argument in _checks(type(self)):
-            value = getattr(self, name)
-            if argument is not None:
-                argument.check(name, value)
+        for name, argument in _checks(type(self)).items():
+            argument.check(name, getattr(self, name))
         check_fields(self)
 
     def need(self, holds: bool, problem: str, *names: str) -> None:
@@ -229,8 +227,9 @@ def docs_of(options: type) -> dict[str, str]:
 
 
 @cache
-def _checks(options: type[Options]) -> Sequence[tuple[str, Argument | None]]:
-    return [(name, argument_of(hint)) for name, hint in get_type_hints(options, include_extras=True).items()]
+def _checks(options: type[Options]) -> dict[str, Argument]:
+    hints = get_type_hints(options, include_extras=True)
+    return {name: argument for name, hint in hints.items() if (argument := argument_of(hint)) is not None}
 
 
 def documented(text: str | None, options: type[Options]) -> str:

@@ -1,6 +1,7 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -31,7 +32,7 @@ from aaplug.io.scenes.pyramid_folder import MANIFEST
 from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import STREAMS, Front
 from aaplug.levels.clusters import rates_of
-from aaplug.levels.merging import Goal, merge, merge_in_chunks
+from aaplug.levels.merging import TOLERANCE, Goal, merge, merge_in_chunks
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
@@ -215,7 +216,7 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
     """
     if not options.single:
         levels = range(1, (options.levels or DEFAULT_LEVELS) + 1)
-        return [Goal.of_level(level, options.merge_below) for level in levels]
+        return [Goal(0.5**level, tolerance=TOLERANCE, smallest=options.merge_below) for level in levels]
     if options.budget is not None:
         columns = len(matrix_of(scene[:0])[0]) + NORMAL_COLUMNS
         header = RECORDS_BYTES + COLUMN_BYTES * columns
@@ -227,8 +228,9 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))
     if count > len(scene):
         raise UsageError("simplify", f"asks for {counted(count, 'Gaussian')}, and the scene has {len(scene):,}")
-    goal = Goal.of_count(max(1, count), scene)
-    return [goal if options.scale is None else replace(goal, rate=options.scale)]
+    count = max(1, count)
+    rate = min(1.0, math.sqrt(count / max(1, len(scene))))  # a quarter is meant for half the size, as on a surface
+    return [Goal(options.scale or rate, count)]
 
 
 def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterator[Level]:
