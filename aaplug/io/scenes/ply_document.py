@@ -15,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.io.ply_header import BIG, LITTLE, TEXT, Header
+from aaplug.io.ply_header import LITTLE, TEXT, Header
 from aaplug.io.scenes.rows import read_rows
 from aaplug.io.values import read_part
 from aaplug.system.errors import FormatError
@@ -38,7 +38,7 @@ class Table:
     def read(self, start: int, stop: int) -> np.ndarray:
         """The rows from start up to stop."""
         if self.parsed is not None:
-            return self.parsed[start:stop]
+            return np.array(self.parsed[start:stop])  # of a file that is mapped
         self._check_unchanged()
         return read_rows(self.path, self.dtype, start, stop, self.offset)
 
@@ -84,26 +84,14 @@ def stamp_of(path: Path) -> tuple[int, int]:
 
 def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
     """Locate the tables of a file; parse those that numpy cannot read."""
-    order = ">" if header.coding == BIG else "<"
-    dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
-    at, offset = header.elements.index(header.vertex), header.start_of(header.vertex)
-    table = Table(path, offset, header.vertex.count, dtype, stamp)
+    vertex = header.vertex
     if header.coding == LITTLE and not any(e.lists for e in header.elements):
-        return _located(header, table)
-    if header.coding == BIG and len(header.elements) == 1:
-        return Document(header, table)
-    elements = _parsed(header)
-    data = elements[at].data
-    if header.coding == LITTLE and header.plain:
-        offset = int(getattr(data, "offset", offset))
-        return _located(header, Table(path, offset, table.count, dtype, stamp))
-    before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
+        dtype, start = np.dtype([(p.name, "<" + p.code) for p in vertex.properties]), header.start_of(vertex)
+        table, end = Table(path, start, vertex.count, dtype, stamp), start + vertex.least_size
+        return Document(header, table, (header.size, start), (end, stamp[0]))
+    elements, at = _parsed(header), header.elements.index(vertex)
+    data, before, after = elements[at].data, _little(elements[:at]), _little(elements[at + 1 :])
     return Document(header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after)
-
-
-def _located(header: Header, table: Table) -> Document:
-    end = table.offset + header.vertex.least_size
-    return Document(header, table, (header.size, table.offset), (end, table.stamp[0]))
 
 
 def _parsed(header: Header) -> tuple[PlyElement, ...]:
