@@ -26,7 +26,7 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import VERBS, Answer, Command, Option, Words, json_of, output
+from .words import VERBS, Answer, Command, Option, Words, json_of, output, scene_paths
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
@@ -158,11 +158,10 @@ def finetune(words: Words) -> Answer:
 
 @verb(
     SceneOptions,
-    Option(
+    scene_paths(
         "more",
-        flag("[SCENE ...]", read=as_path, by_place=True, count=None),
+        "[SCENE ...]",
         "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
-        (),
     ),
     BATCH,
     Option(
@@ -218,11 +217,10 @@ def video(words: Words) -> Answer:
 
 
 @verb(
-    Option(
+    scene_paths(
         "scenes",
-        flag("SCENE SCENE [SCENE ...]", read=as_path, by_place=True, count=None),
+        "SCENE SCENE [SCENE ...]",
         "Two or more scenes of any format, or their folders; the others are compared with the first.",
-        (),
     ),
     Option("reference", flag("SCENE", read=as_path), "The scene to compare the others with, instead of the first."),
     CameraOptions,
@@ -263,9 +261,7 @@ def compare(words: Words) -> Answer:
 
 
 @verb(
-    Option(
-        "scenes", flag("SCENE [SCENE ...]", read=as_path, by_place=True, count=None), "The scenes, of any format.", ()
-    ),
+    scene_paths("scenes", "SCENE [SCENE ...]", "The scenes, of any format."),
     CameraOptions,
     output("FILE", WRITTEN + "."),
     verbs.MergeOptions,

@@ -92,6 +92,11 @@ def output(metavar: str, text: str, default: Any = MISSING) -> Option:
     return Option("output", flag(metavar, "-o", read=as_path), text, default)
 
 
+def scene_paths(name: str, metavar: str, text: str) -> Option:
+    """The option without a name that takes one or more scenes."""
+    return Option(name, flag(metavar, read=as_path, by_place=True, count=None), text, ())
+
+
 def json_of(what: str) -> Option:
     """The option that prints a result as JSON."""
     return Option("json", None, f"Print {what} on stdout.", False)

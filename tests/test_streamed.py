@@ -267,11 +267,10 @@ def test_nothing_is_left_of_a_longer_run_that_was_cut_short_and_parts_are_for_th
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{}", "parts_1.json.*a list of parts"),
-        ("[]", "parts_1.json.*a list of parts"),
-        ("[[1, 2], []]", "parts_1.json.*7 numbers"),
-        ("", "parts_1.json.*JSON"),
-        ("[[]]", "the same number of parts; parts_0.json lists 2, parts_1.json lists 1; .*--overwrite"),
+        ("[]", ": is damaged"),
+        ("[[1, 2], []]", "parts_1.json: is damaged"),
+        ("", "parts_1.json: should be JSON"),
+        ("[[]]", ": is damaged"),
         ("[[], [1, 0, 0, 0, 1, 1, 1]]", "1_1/meta.json: is missing: parts_1.json lists it; .*--overwrite"),
     ],
 )

@@ -37,7 +37,7 @@ from aaplug.io.scenes import gltf, read_scene, spz, write_scene
 from aaplug.io.scenes.pyramid_folder import MAX_GAUSSIANS
 from aaplug.io.scenes.record import MOVED_SHARE
 from aaplug.io.scenes.rows import library_errors
-from aaplug.io.values import Place, natural, numbers, object_of, read_json
+from aaplug.io.values import natural, object_of, read_json
 from aaplug.system.errors import FormatError, OutputError, UsageError, counted, reason
 from aaplug.system.executors import Threads, given_threads
 
@@ -64,9 +64,8 @@ SETTINGS, PAGE = "settings.json", "index.html"
 PAGE_SCRIPTS = ("orbit.js", "problems.js")
 Middle = Float[Tensor, " 3"]  # in float64
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
-FACTS = 7  # numbers that tell of a part: its Gaussians, and the smallest and largest coordinates
-MAKE_AGAIN = "`aaplug lod --overwrite` makes all levels again"
-NOTHING = [0.0, *[math.inf] * 3, *[-math.inf] * 3]  # of an empty part
+# What is told of a part: the number of its Gaussians, and their smallest and largest coordinates; here of an empty one
+NOTHING = [0.0, *[math.inf] * 3, *[-math.inf] * 3]
 
 log = logging.getLogger("aaplug")
 
@@ -194,8 +193,7 @@ def read_front(folder: Path, number: int) -> Front:
         parents, owners = (torch.from_numpy(arrays[name]) for name in Front._fields[1:])
     parts = [read_scene(path).gaussians() for path in paths if path.is_file()]
     total, tops = sum(map(len, parts)), int((parents < 0).sum())
-    above = (parents < 0) | ((parents > torch.arange(len(parents))) & (parents < total))
-    if len(parents) != total or len(owners) != tops or not total or not bool(above.all()):
+    if len(parents) != total or len(owners) != tops:
         raise FormatError(tree, f"does not belong to the {total:,} Gaussians beside it")
     return Front(joined([replace(part, origin=None) for part in parts]), parents, owners)
 
@@ -250,11 +248,8 @@ def write_index(
     if tree is not None:
         content, settings = rad_of(tree_of(tree.scene, tree.parents)), _spark_settings(tree)
     else:
-        facts = [_read_parts(folder, stream, number) for number in range(levels)]
-        if len({*map(len, facts)}) > 1:
-            listed = ", ".join(f"{facts_file(folder, n).name} lists {len(each)}" for n, each in enumerate(facts))
-            raise FormatError(folder, f"every level should have the same number of parts; {listed}; {MAKE_AGAIN}")
-        parts = torch.tensor(facts, dtype=torch.float64)
+        with library_errors(folder):
+            parts = torch.stack([_read_parts(folder, stream, number) for number in range(levels)])
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
         if middle is not None and name == "3dtiles":
             index["root"]["transform"][12:15] = (0.0 - middle[TILE_AXES]).tolist()  # no -0.0
@@ -279,15 +274,15 @@ def _json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=1).encode()
 
 
-def _read_parts(folder: Path, stream: Stream, level: int) -> list[list[float]]:
+def _read_parts(folder: Path, stream: Stream, level: int) -> Float[Tensor, "leaves 7"]:
     """The facts that `write_level` wrote about a level's parts, whose files must be there."""
     path = facts_file(folder, level)
-    document, place = read_json(path), Place(path, "the file")
-    place.expect(isinstance(document, list) and len(document) > 0, "it", "a list of parts", document)
-    for leaf, fact in enumerate(document):
-        if fact and not (content := folder / stream.part(level, leaf)).is_file():
-            raise FormatError(content, f"is missing: {path.name} lists it; {MAKE_AGAIN}")
-    return [numbers(fact, FACTS, place, "a part") if fact else NOTHING for fact in document]
+    with library_errors(path):
+        facts = torch.tensor([fact or NOTHING for fact in read_json(path)], dtype=torch.float64).view(-1, len(NOTHING))
+    for leaf in facts[:, 0].nonzero()[:, 0].tolist():
+        if not (content := folder / stream.part(level, leaf)).is_file():
+            raise FormatError(content, f"is missing: {path.name} lists it; `aaplug lod --overwrite` makes all again")
+    return facts
 
 
 def programs_of(name: StreamName, modules: Path) -> list[Path]:

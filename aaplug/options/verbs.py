@@ -113,9 +113,10 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
         super().__post_init__()
         for paths, of_them in ((RECEDING_PATHS, ("start", "end")), (BUILT_IN_PATHS, ("seconds", "views"))):
             self.need(str(self.path) in paths, f"is for the paths {listing(paths)}, not for {self.path}", *of_them)
-        if str(self.path) == "zoom" and self.lens not in (None, "pinhole", "ortho"):
-            problem = f"{self.lens} sets its own angle, which zoom would change; give `path` dolly or orbit"
-            raise UsageError("lens", problem)
+        is_right = str(self.path) != "zoom" or self.lens in ("pinhole", "ortho")
+        self.need(
+            is_right, f"{self.lens} sets its own angle, which zoom would change; give `path` dolly or orbit", "lens"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

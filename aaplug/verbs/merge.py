@@ -98,9 +98,7 @@ def _places(
         width, rest = divmod(len(values), count)
         if rest or width not in widths:
             wanted = " or ".join(f"{count * each}" for each in widths)
-            alike = f", {' or '.join(map(str, widths))} for every one" * (len(widths) > 1)
-            what = f"expected {wanted} numbers for {counted(count, 'scene')}{alike}"
-            raise UsageError(name, f"{what}, got {len(values)}")
+            raise UsageError(name, f"expected {wanted} numbers for {counted(count, 'scene')}, got {len(values)}")
         return [values[i * width : (i + 1) * width] for i in range(count)]
 
     turns = list[Float[Tensor, "3 3"]]()

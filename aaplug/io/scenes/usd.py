@@ -30,7 +30,7 @@ from aaplug.io.scenes.packed import floats, half_turn_about_z, logit_of, of_degr
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, text
+from aaplug.io.values import Entry, Place, natural, parse_json
 from aaplug.system.errors import FormatError, OutputError
 from aaplug.system.extras import check_installed
 from aaplug.system.locks import scratch
@@ -67,11 +67,9 @@ class UsdFormat:
         check_installed(PACKAGE, self.extra, "path", f"{path.suffix} files need the extra `usd`")
         with library_errors(path), scratch() as folder:
             told, arrays = _told(path, folder / "arrays.npz")
-            stage = object_of(told, path, "the stage", "what is in it")
-            if "refused" in stage:
-                raise FormatError(path, stage.get("refused", text))
-            prims = entries(path, "prim", stage.value("prims"))
-            parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(prims)]
+            if "refused" in told:
+                raise FormatError(path, told["refused"])
+            parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(told["prims"])]
             degree = max(part.sh_degree for part in parts)
             scene = joined([of_degree(part, degree) for part in parts])
             said = told["record"]
@@ -115,9 +113,9 @@ def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
         return parse_json(run.stdout.splitlines()[-1], path), dict(arrays)
 
 
-def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
-    place = Place(path, f"prim {prim.value('name')}")
-    each = (natural(prim.value("degree"), place, DEGREE, MAX_DEGREE) + 1) ** 2
+def _read(path: Path, prim: dict[str, Any], number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
+    place = Place(path, f"prim {prim['name']}")
+    each = (natural(prim["degree"], place, DEGREE, MAX_DEGREE) + 1) ** 2
 
     def column(name: str, width: int, rows: int | None = None) -> Tensor:
         key = f"{number} {name}"
@@ -132,7 +130,7 @@ def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], u
     turned = column("orientations", 4, count).roll(1, dims=1)  # numpy's view has the real part last
     logits, log_scales = logit_of(column("opacities", 1, count)[:, 0]), column("scales", 3, count).log()
     sh = column(HARMONICS, 3, count * each).reshape(count, each, 3)
-    motion = prim.matrix("motion", 4, 4).T
+    motion = Entry(place, prim).matrix("motion", 4, 4).T
     standing_up = FROM_Z_UP @ motion if up == "Z" else motion
     return standing(Gaussians(means, turned, log_scales, logits, sh), standing_up, place)
 
