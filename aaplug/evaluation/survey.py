@@ -1,6 +1,7 @@
 """Statistics of a whole scene, gathered part by part in bounded memory."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -66,7 +67,7 @@ class Survey:
     multiples: Histogram = field(default_factory=lambda: Histogram(-20.0, 20.0))
     largest: float = -math.inf
     filtered: bool = False
-    faults: dict[str, int] = field(default_factory=dict)
+    faults: Counter[str] = field(default_factory=Counter)
 
 
 def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:

@@ -6,6 +6,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -220,7 +221,7 @@ class Scene:
         facts = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
         return replace(rows, **facts, origin=origin)
 
-    def parts(self, size: int = PART, faults: dict[str, int] | None = None) -> Iterator[Gaussians]:
+    def parts(self, size: int = PART, faults: Counter[str] | None = None) -> Iterator[Gaussians]:
         """The scene part by part, at least one, checked.
 
         size: Gaussians per part.
@@ -230,19 +231,14 @@ class Scene:
         Raises:
             FormatError: a row cannot be used, and neither `drop_bad` nor `faults` asks to leave it out.
         """
-        dropped: dict[str, int] = {} if faults is None else faults
-        left_out = 0
+        dropped, left_out = Counter[str]() if faults is None else faults, 0
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
-            if self.path is None:
-                yield part
-                continue
             if found := faults_of(part):
                 if faults is None and not self.drop_bad:
                     what = described_faults(found, start)
-                    raise FormatError(self.path, f"{what}; pass `drop_bad` to leave such rows out")
-                for text, rows in found.items():
-                    dropped[text] = dropped.get(text, 0) + int(rows.sum())
+                    raise FormatError(self.name, f"{what}; pass `drop_bad` to leave such rows out")
+                dropped.update({text: int(rows.sum()) for text, rows in found.items()})
                 good = usable(part)
                 left_out, part = left_out + len(part) - len(good), good
             yield part
