@@ -96,7 +96,7 @@ def test_degrees_records_and_places_are_brought_together():
     ("options", "problem"),
     [
         ({"move": (1.0, 2.0, 3.0)}, "move: expected 6 numbers for 2 scenes, got 3"),
-        ({"turn": (0.0,) * 7}, "turn: expected 6 or 8 numbers for 2 scenes, 3 or 4 for every one, got 7"),
+        ({"turn": (0.0,) * 7}, "turn: expected 6 or 8 numbers for 2 scenes, got 7"),
         ({"turn": (0.0,) * 8}, "a quaternion, got one of length 0"),
         ({"scale": (1.0, 0.0)}, "scale: takes"),
         ({"into": "nothing"}, "into: 'nothing' is not one of"),
