@@ -91,11 +91,6 @@ class Header:
         return "".join(line + self.newline for line in self.lines).encode(ENCODING)
 
     @property
-    def plain(self) -> bool:
-        """True if plyfile can read it: all ASCII, no empty lines."""
-        return self.content.isascii() and len(self.content) == self.size
-
-    @property
     def comments(self) -> list[str]:
         """The comments, in order, without the word "comment"."""
         return [_comment(line) for line in self.lines if _keyword(line) == "comment"]

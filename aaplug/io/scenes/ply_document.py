@@ -98,7 +98,7 @@ def _parsed(header: Header) -> tuple[PlyElement, ...]:
     """All tables; a header that plyfile cannot read is given to it in ASCII and without empty lines."""
     with open(header.path, "rb") as file, warnings.catch_warnings(action="ignore"):  # numpy's, about empty lists
         stream = file
-        if not header.plain:
+        if not header.content.isascii() or len(header.content) < header.size:
             file.seek(header.size)
             stream = io.BytesIO(header.content.decode("ascii", "replace").encode("ascii", "replace") + file.read())
         elements = PlyData.read(stream, mmap="r").elements

@@ -37,7 +37,7 @@ from aaplug.system.registry import registry_of
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
 FOLDER_INDEXES = ("meta.json", STREAM_INDEXES["sog"])  # each marks a folder that is a scene: of SOG images, of chunks
-PROBES = 512  # evenly spaced places in the file, from which the frame check samples
+PROBES = 512  # evenly spaced places in the file that `sample` reads: few enough to read before the work
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
 MAX_HARMONICS_BYTES = 2 * 10**9  # reading more for each view costs less than holding them; 10 M Gaussians of degree 3
@@ -253,7 +253,8 @@ class Scene:
 
     def sample(self, each: int) -> Gaussians:
         """Usable Gaussians from evenly spaced places, `each` at a place: enough to know where the scene is."""
-        return usable(joined([self.raw(p.start, p.stop) for p in probes(self.count, each)] or [self.raw(0, 0)]))
+        starts = range(0, max(1, self.count), max(each, self.count // PROBES))
+        return usable(joined([self.raw(start, min(start + each, self.count)) for start in starts]))
 
     def check_memory(self, harmonics: bool = True) -> None:
         """Refuse a scene above the limit MEMORY_SHARE of the machine's memory, with or without harmonics."""
@@ -321,12 +322,6 @@ def memory_of(count: int, degree: int | None = None) -> int:
 def held_rows(held: Gaussians, start: int, stop: int) -> Gaussians:
     """The rows from start up to stop of Gaussians in memory."""
     return held[start:stop]
-
-
-def probes(count: int, each: int) -> list[range]:
-    """Rows at evenly spaced places of a file of so many, `each` at a place: few enough to read before the work."""
-    step = max(each, count // PROBES)
-    return [range(start, min(start + each, count)) for start in range(0, count, step)]
 
 
 def harmonics_in_file(
