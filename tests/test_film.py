@@ -26,6 +26,7 @@ VIEW = make_camera((0.0, -4.0, 0.0))
 MOVED = make_camera((0.5, -4.0, 0.2))
 ZOOMED = VIEW, replace(MOVED, fx=1.2 * VIEW.fx, fy=1.2 * VIEW.fy, cx=VIEW.cx + 2.0)
 APERTURE = Aperture(radius=0.1, focus=3.0)
+MANY = 512  # samples
 
 
 def exposed(aperture=None, motion=None, samples=16):
@@ -76,10 +77,10 @@ def test_the_plane_in_focus_stays_and_the_rest_moves():
 )
 def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion, lens):
     """The slow twin: places in float64 under the cameras of the samples; a fisheye's planes lie along its image."""
-    scene, camera = make_scene(30), exposed(aperture, None, 1024)
+    scene, camera = make_scene(30), exposed(aperture, None, MANY)
     if motion is not None:
         motion = tuple(replace(each, lens=lens) for each in motion)
-        camera = replace(toward(*motion, 0.5), exposure=Exposure(aperture, motion, 1024))
+        camera = replace(toward(*motion, 0.5), exposure=Exposure(aperture, motion, MANY))
     splats = project(scene, camera)
     means = scene.means[splats.sources]
 
@@ -88,7 +89,7 @@ def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion
         offsets = places - places.mean(dim=0)
         return (offsets[..., :, None] * offsets[..., None, :]).mean(dim=0)
 
-    truth = covariance(camera) - covariance(replace(camera, exposure=Exposure(None, None, 1024)))
+    truth = covariance(camera) - covariance(replace(camera, exposure=Exposure(None, None, MANY)))
     truth = torch.stack([truth[:, 0, 0], truth[:, 0, 1], truth[:, 1, 1]], dim=1)
     assert torch.allclose(spread(splats, camera).double(), truth, rtol=0.05, atol=0.05)
 

@@ -3,6 +3,7 @@
 import math
 import pickle
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -57,14 +58,15 @@ def centres(width: int, height: int) -> np.ndarray:
     return np.stack([columns.ravel(), rows.ravel()], axis=1)
 
 
+@cache
 def taken_through(lens: tuple[str, tuple[float, ...]], times: int = 1) -> np.ndarray:
     """The plane's photograph, `times` as fine as the camera: each pixel's ray by fixed-point iteration."""
     width, height = (times * side for side in SIZE)
     fx, fy, cx, cy = (times * value for value in PINHOLE)
     target = (centres(width, height) - (cx, cy)) / (fx, fy)
     rays = target.copy()
-    for _ in range(80):
-        rays += 0.7 * (target - bend(rays, lens))
+    for _ in range(30):
+        rays += target - bend(rays, lens)
     assert np.abs(bend(rays, lens) - target).max() < 1e-9
     return plane(rays).reshape(height, width, 3)
 
