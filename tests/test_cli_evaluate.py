@@ -40,10 +40,20 @@ def test_the_library_gives_what_the_command_line_gives(cli):
     assert {key: found["_aaplug"][key] for key in own.protocol} == own.protocol
 
 
-@pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,1/2", "--scale 1 1/2 --recipe=mip,auto,"])
-def test_commas_part_values_as_spaces_do(several):
-    words = VERBS["evaluate"].parse(f"scene.ply --cameras . {several} -o a,b".split())
-    assert (words.recipe, words.scale, words.output) == (("mip", "auto"), (1.0, 0.5), Path("a,b"))
+@pytest.mark.parametrize(
+    "words",
+    [
+        "scene.ply --cameras . --recipe mip,auto --scale 1,1/2 -o a,b",
+        "./scene.ply --cameras . --scale 1 1/2 --recipe=mip,auto, --output=a,b",
+        "--cameras . -o a,b --recipe mip auto --scale=1,1/2 scene.ply",
+        "--cameras . -o a,b --recipe mip auto --scale 1 0.5 ./scene.ply",
+        "--cameras . -o a,b --recipe mip --scale 1 0.5 --recipe mip auto ./scene.ply",
+    ],
+)
+def test_commas_part_values_as_spaces_do_and_a_scene_may_follow_several(words):
+    found = VERBS["evaluate"].parse(words.split())
+    expected = Path("scene.ply"), ("mip", "auto"), (1.0, 0.5), Path("a,b")
+    assert (found.scene, found.recipe, found.scale, found.output) == expected
 
 
 def test_all_leaves_out_what_does_not_suit_the_scene_whose_own_look_is_the_truth_without_photographs(cli):

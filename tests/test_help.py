@@ -10,6 +10,7 @@ import pytest
 from aaplug_cli.verbs import VERBS
 
 from aaplug.methods import RECIPES
+from aaplug.options.base import Number
 from aaplug.options.verbs import IN_TIME, LOSS_WEIGHTS
 from aaplug.system.registry import names_of
 from tests.conftest import GUIDES, ROOT
@@ -57,8 +58,8 @@ def test_help_begins_with_examples_and_lists_each_verb_with_its_first_line_only(
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
-    text = cli(f"{verb} --help")[1]
+def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another_and_shows_every_range(program, verb):
+    text = program(f"{verb} --help")[1]
     usage, about = HEADING.split(text)[0].strip().split("\n", 1)
     assert usage.startswith(f"usage: aaplug {verb} ")
     first, when = about.strip().split("\n\n")
@@ -66,6 +67,11 @@ def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
     assert any(re.search(rf"\b{other}\b", when) for other in VERBS if other != verb), when
     assert ("path file" in text) == (verb in ("render", "video"))
     assert "guides/" not in text, "a guide's file, which the wheel lacks"
+    shown = "".join(text.split())
+    assert not re.search(r"default:(True|False|None|inf)\)", shown), "of a switch"
+    for option in VERBS[verb].options.values():
+        if isinstance(option.argument, Number):
+            assert f"{option.flags[0]}{option.argument.metavar}".replace(" ", "") in shown
 
 
 def test_render_shows_few_options_before_those_with_a_heading(cli):

@@ -12,7 +12,6 @@ import pytest
 from aaplug_cli import console
 from aaplug_cli.console import TERMINAL, refuse, table
 from aaplug_cli.main import main
-from aaplug_cli.verbs import VERBS
 from rich.console import Console
 
 from aaplug.io.cameras import read_cameras
@@ -87,12 +86,6 @@ def test_a_folder_may_have_a_dot(cli):
     cli.done("render scene.ply --cameras . -o results_v1.0 --scale 0.5")
     assert [path.name for path in Path("results_v1.0").iterdir()] == ["r_0.png"]
     assert "name a folder" in cli("render scene.ply --cameras . -o new.tiff --scale 0.5")[2]
-
-
-@pytest.mark.parametrize("before", ["--scale 0.5 0.25", "--scale=0.5,0.25", "--scale 0.5 0.25 --recipe mip"])
-def test_a_scene_may_follow_an_option_of_several_values(before):
-    words = VERBS["evaluate"].parse(f"--cameras . --recipe mip {before} ./scene.ply".split())
-    assert (words.scene, words.scale) == (Path("scene.ply"), (0.5, 0.25))
 
 
 def test_an_error_of_the_system_is_told_by_what_it_is(monkeypatch, capsys):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from aaplug.core import shading
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project, with_ray_slopes
+from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, moved, straight_camera
@@ -18,20 +19,16 @@ from tests.conftest import make_camera, make_scene, moved, straight_camera
 F64 = torch.float64
 
 
+@pytest.mark.parametrize("near", [0.01, RULES_3DGS.near, 2.0])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_the_near_plane_itself_is_not_drawn(dtype):
+def test_what_lies_beyond_the_near_plane_is_drawn_and_the_plane_itself_is_not(dtype, near):
     scene = make_scene(5, dtype=dtype)
-    depths = torch.tensor([0.2, 0.2001, -1.0, 0.0, 3.0], dtype=dtype)
+    depths = torch.tensor([near, 1.001 * near, -1.0, 0.0, 3.0], dtype=dtype)
     scene = replace(scene, means=torch.nn.functional.pad(depths[:, None], (2, 0)))
-    splats = project(scene, straight_camera())
+    splats = project(scene, straight_camera(), rules=Rules(near=near))
     assert splats.sources.tolist() == [1, 4]
     torch.testing.assert_close(splats.depths, depths[[1, 4]])
     torch.testing.assert_close(splats.opacities, scene.opacities[[1, 4]])
-
-
-def test_a_scene_behind_the_camera_has_no_splats():
-    scene, camera = replace(make_scene(1), means=torch.tensor([[0.0, 0.0, -1.0]])), straight_camera()
-    assert shade(project(scene, camera), scene, camera).rgb.shape == (0, 3)
 
 
 def needles(n: int, long: float, thin: float) -> Gaussians:

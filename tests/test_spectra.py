@@ -27,10 +27,6 @@ def test_the_response_is_the_fourier_transform_of_alpha():
     torch.testing.assert_close(frequency_response(SPLATS, omega), expected, rtol=1e-6, atol=1e-5)
 
 
-def test_the_energy_is_the_integral_of_the_squared_alpha():
-    torch.testing.assert_close(energies(SPLATS)[0], ALPHA.square().sum(dim=1) * STEP**2, rtol=1e-6, atol=0.0)
-
-
 def test_the_share_above_nyquist_is_that_of_the_squared_response_outside_the_band():
     step = math.pi / 50
     line = (torch.arange(-250, 250, dtype=F64) + 0.5) * step
