@@ -242,7 +242,7 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     write_scene("same.ply", scene)
-    words = f"compare scene.ply dim.ply same.ply {WORDS} -o out --show 1"
+    words = f"compare scene.ply dim.ply same.ply {WORDS} -o out --show 1 --metric psnr"
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "add", killed_at(2))
         assert cli(words)[0] == 130

@@ -331,7 +331,7 @@ def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
         "large, alone": replace(SCENE, log_scales=SCENE.log_scales + 3)[:1],
     }[scene]
     for tuning in {"refine": False}, {"steps": 1, "overwrite": True}:
-        levels = aaplug.lod(given, CAMERAS, tmp_path, to="rad", levels=3, min_seen=0.0, **tuning)
+        levels = aaplug.lod(given, CAMERAS, tmp_path, to="rad", levels=LEVELS, min_seen=0.0, **tuning)
         assert len(levels[0].scene) == len(given)
     assert bool(read_rad(tmp_path / "scene.rad")["child_count"].max() > 0) is (len(given) > 1)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.rad", streamed.SETTINGS}
