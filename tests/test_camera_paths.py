@@ -95,6 +95,9 @@ BROKEN = {
     "far away": (document(camera_path=[{"camera_to_world": FAR, "fov": 50}]), "camera 0: .* a translation of at most"),
     "a short pose": (document(camera_path=[{"camera_to_world": [1], "fov": 50}]), "camera_to_world"),
 }  # fmt: skip
+for wrong in ({"radius": 0, "focus": 3}, {"radius": 1}, {"radius": 1, "focus": 1, "blades": 2}, 3):
+    lensed = document(camera_path=[document()["camera_path"][0] | {"aperture": wrong}])
+    BROKEN[f"an aperture of {wrong}"] = lensed, "aperture|focus"
 
 
 @pytest.mark.parametrize("case", BROKEN)

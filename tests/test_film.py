@@ -18,7 +18,7 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
 from aaplug.options.shared import FilmOptions
 from aaplug.rendering.film import filmed
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 from tests.test_camera_paths import document
 
@@ -320,12 +320,3 @@ def test_a_path_file_brings_its_aperture_and_shutter(tmp_path):
     with pytest.raises(UsageError, match=r"lens: an aperture .*; `samples` of 0 leaves out that of"):
         aaplug.render(scene, cameras, tmp_path / "out", **how)
     assert len(aaplug.render(scene, cameras, tmp_path / "out", samples=0, **how)) == 2
-
-
-@pytest.mark.parametrize("wrong", [{"radius": 0, "focus": 3}, {"radius": 1}, {"radius": 1, "focus": 1, "blades": 2}, 3])
-def test_a_wrong_aperture_in_a_file_is_refused(tmp_path, wrong):
-    path = document()
-    path["camera_path"][0]["aperture"] = wrong
-    (tmp_path / "path.json").write_text(json.dumps(path))
-    with pytest.raises(FormatError, match=r"aperture|focus"):
-        read_camera_path(tmp_path / "path.json")
