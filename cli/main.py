@@ -14,7 +14,7 @@ from importlib.metadata import version
 from textwrap import fill
 
 from aaplug.system.allocator import keep_freed_memory
-from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
+from aaplug.system.errors import FULL, AaplugError, UsageError, did_you_mean, printable, reason
 from aaplug.system.signals import end_as_by_interrupt
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130  # exit codes
@@ -53,7 +53,7 @@ def main(words: Sequence[str] | None = None) -> None:
         _drop_output()  # where the disk is full, nothing can be flushed at exit
         if isinstance(error, BrokenPipeError):  # of the log
             sys.exit(FAILED)
-        where = error.filename or f"unexpected {type(error).__name__}"
+        where = error.filename or ("output" if error.errno in FULL else f"unexpected {type(error).__name__}")
         print(f"error: {printable(f'{where}: {reason(error)}')}", file=sys.stderr)
         sys.exit(REFUSED)
 
