@@ -180,6 +180,16 @@ def test_the_result_is_the_mean_of_the_last_steps():
         torch.testing.assert_close(leaf.detach(), sum(step[name] for step in steps[3:]) / 3, rtol=1e-6, atol=1e-6)
 
 
+def test_infinite_parameters_are_averaged_as_what_they_look_like():
+    job = make_job(settings=replace(SETTINGS, averaged=0.5))
+    job.start.scene.logit_opacities[:2] = torch.tensor([-torch.inf, torch.inf])
+    job.start.scene.log_scales[2, 0] = -torch.inf
+    state = begin(job)
+    run(job, state)
+    assert all(leaf.isfinite().all() for leaf in state.leaves.values())
+    assert state.leaves["logit_opacities"][:2].sigmoid().tolist() == pytest.approx([0, 1], abs=1e-3)
+
+
 def test_no_step_leaves_a_gaussian_thinner_than_its_bound():
     job = make_job(settings=replace(SETTINGS, rates={"log_scales": 0.5}, anchor=0.0))
     first, nyquist = job.start.scene.log_scales, 0.2**0.5 / job.start.training.bounds.highest_or_coarsest[:, None]

@@ -29,15 +29,17 @@ RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share
     "dc": 2.5e-3,
     "rest": 2.5e-3 / 20,
 }
+SATURATED = 1e3  # a logit or log-scale that looks like an infinite one, in float64 too
 EXTENT_MARGIN = 1.1  # times the training cameras' farthest distance from their mean (3DGS)
 
 
 def leaves_of(scene: Gaussians) -> Leaves:
-    """Copies of every parameter."""
+    """Copies of every parameter; infinite ones become finite numbers of the same look, which steps can average."""
     leaves = {name: getattr(scene, name) for name in WHOLE} | {"dc": scene.sh[:, :1], "rest": scene.sh[:, 1:]}
     if scene.learned:
         leaves[LEARNED_COLUMNS] = torch.stack([scene.extras[name] for name in scene.learned], dim=1)
-    return {name: value.detach().clone() for name, value in leaves.items()}
+    ends = {"nan": torch.nan, "posinf": SATURATED, "neginf": -SATURATED}
+    return {name: value.detach().nan_to_num(**ends) for name, value in leaves.items()}
 
 
 def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:

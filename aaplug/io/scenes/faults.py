@@ -16,15 +16,15 @@ SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter 
 def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     """Unusable values and their rows: NaN, infinities, quaternions without a direction, negative filters.
 
-    A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
+    A log-scale of -inf (no thickness) and a logit of -inf (invisible) or +inf (opaque) are valid.
     """
     nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
     finite = all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in scene.columns.values())
     names, matrix = ([], torch.empty(0, 0)) if finite else matrix_of(scene)
     for name, values in zip(names, matrix.T, strict=True):
-        allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0], torch.nan)
+        limits = {"opacity": (-torch.inf, torch.inf), "scale": (-torch.inf,)}.get(name.split("_")[0], ())
         nans[f"NaN in {name}"] = values.isnan()
-        infinities[f"Inf in {name}"] = values.isinf() & (values != allowed)
+        infinities[f"Inf in {name}"] = values.isinf() & ~torch.isin(values, values.new_tensor(limits))
     length = torch.linalg.vector_norm(scene.quats, dim=-1)
     faults = {**nans, **infinities, "a quaternion of length zero": length <= SHORTEST_QUATERNION}
     faults["a quaternion too long for float32"] = length.isinf() & scene.quats.isfinite().all(dim=-1)
