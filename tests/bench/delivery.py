@@ -100,12 +100,12 @@ def main(scenes: int = 1000) -> None:
 
 
 def _exchange(folder: Path, program: str) -> None:
-    """Largest differences of position and log-scale: ours as it reads them, and theirs as we do."""
-    heading("splat-transform", "file", "whose", "Gaussians", "position, of the extent", "log-scale", "harmonics")
+    """Largest differences: ours as it reads them, and theirs as we do."""
+    columns = ("file", "whose", "Gaussians", "position, of the extent", "log-scale", "opacity", "harmonics")
+    heading("splat-transform", *columns)
     scene = replace(random_scene(203), convention=CONVENTIONS["mip"])
     size = scene.means.std()
     scene = replace(scene, means=scene.means / size, log_scales=(scene.log_scales - size.log()).clamp(-9, 5))
-    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(-5, 5))  # a byte of 0 has no logit
     write_scene(folder / "scene.ply", scene)
 
     def transform(source: str, target: str) -> None:
@@ -140,6 +140,7 @@ def _compare(file: str, whose: str, first: Gaussians, second: Gaussians) -> None
     errors = [
         float((first.means - second.means).abs().max()) / extent,
         float((first.log_scales - second.log_scales).abs().max()),
-        float((first.sh[:, 1:k] - second.sh[:, 1:k]).abs().max()) if k > 1 else 0.0,
+        float((first.opacities - second.opacities).abs().max()),
+        float((first.sh[:, :k] - second.sh[:, :k]).abs().max()),
     ]
     row(file, whose, f"{len(first)} of {len(nearest.unique())}", *(f"{error:.1e}" for error in errors))
