@@ -49,7 +49,7 @@ def test_a_full_disk_behind_stdout_is_one_line(cli, words):
 
     assert exit_code(run) == 2
     err = Path("err").read_text()
-    assert err.splitlines()[-1] == "error: unexpected OSError: no space left on device"
+    assert err.splitlines()[-1] == "error: output: no space left on device"
     assert "Traceback" not in err
 
 

@@ -233,11 +233,9 @@ def in_turn(
 
 def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], limits: Limits) -> Float[Tensor, "t P"]:
     """1 - alpha, with alpha capped."""
-    least = 1 - limits.max_alpha
-    if isinstance(least, Tensor):
-        through = one - alpha  # the maximum of positive floats is that of their bits, an instruction less than `relu`
-        return torch.maximum(through.view(torch.int32), least.view(torch.int32)).view(torch.float32)
-    return (one - alpha).clamp_(min=least)
+    if isinstance(limits.max_alpha, Tensor):
+        return (limits.max_alpha * one - alpha).relu() + (1 - limits.max_alpha)
+    return (one - alpha).clamp_(min=1 - limits.max_alpha)
 
 
 def less(x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
