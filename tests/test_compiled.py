@@ -186,7 +186,7 @@ def test_a_compiler_counts_registers_where_there_are_few(counted, monkeypatch):
     passes, step = (compiled._configs(kernel)["cpp.march"] for kernel in kernels)
     assert ("-fsched-pressure" in passes) == counted
     assert "-fsched-pressure" in step  # it keeps many sums
-    assert ("-mprefer-vector-width=512" in passes) == (not counted)  # by halves a pass takes three times as long
+    assert ("-mprefer-vector-width=512" in passes) == (not counted)  # else vectors are copied by halves
     for target in compiled.TARGETS:
         march = compiled._configs(kernels[0], target)["cpp.march"]
         assert march.startswith(target.name)

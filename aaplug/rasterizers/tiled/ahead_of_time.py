@@ -116,7 +116,7 @@ THIS_PROCESSOR = "native"  # as g++ calls its architecture
 SCHEDULING = ("-fschedule-insns", "-fschedule-insns -fsched-pressure")
 MANY_REGISTERS = "AVX512"  # 32 of vectors; without it there are 16, and g++ has to count them wherever it schedules
 # For Intel's processors g++ copies vectors of 512 bits by halves. A load of the whole then waits until both have left
-# the processor's store buffer, and a pass takes three times as long.
+# the processor's store buffer: up to 10 % of a step with gradients.
 WHOLE_VECTORS = "-mprefer-vector-width=512"
 # clang 14 takes inductor's last word on mathematics for an order to keep floating-point traps, unless another word
 # follows. It then neither joins a product and a sum nor moves them: passes take 1.8 times as long.
