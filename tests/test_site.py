@@ -211,7 +211,7 @@ def test_a_page_that_is_opened_from_its_folder_is_whole_and_can_be_searched(brow
     assert page.evaluate("document.querySelector('td code').getClientRects().length") == 1
     code, button = (page.locator(f"pre > {part}").bounding_box() for part in ("code", ".md-code__nav"))
     assert code["x"] + code["width"] <= button["x"]
-    page.locator(".md-header [for=__search]:visible, .md-search__input:visible").first.click()
+    page.locator(".md-header__button[for=__search]:visible, .md-search__input:visible").first.click()
     page.keyboard.type("zebra")
     assert "page.html?h=" in page.locator(".md-search-result__link").first.get_attribute("href")
     page.close()
