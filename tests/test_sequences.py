@@ -52,6 +52,12 @@ def test_threads_may_ask_for_different_frames(folder):
     assert len(renderer.at(1).scene) == 40
 
 
+def test_a_frame_can_be_drawn_as_of_another_training(folder):
+    frame = Renderer.of(folder, CAMERAS, "classic", rasterizer="eager").at(1)
+    finer = replace(frame, training=frame.training.finer(2.0))
+    assert frame.trained_at(2.0)(CAMERAS.test[0]).rgb.equal(finer(CAMERAS.test[0]).rgb)
+
+
 def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):
     together, apart = (
         Renderer.of(read_scene(folder, frames_apart=flag), CAMERAS, "mip-splatting", rasterizer="eager")

@@ -162,9 +162,13 @@ class Renderer:
     @contract
     def trained_at(self, factor: Factor) -> "Renderer":
         """The same scene as if training had sampled it `factor` times as finely; its world filter is applied anew."""
-        assert self.source is not None
         training = self.training.finer(factor)
-        return Renderer.of(self.source, training, self.recipe, background=self.background, rasterizer=self.rasterizer)
+        cutter = None if self.cutter is None else Cutter.of(self.cutter.pyramid, training)
+        if self.recipe.world is None:
+            return replace(self, training=training, cutter=cutter)
+        assert self.source is not None
+        raw = without_harmonics(self.source)[0] if self.cutter is None else self.cutter.pyramid.scene
+        return replace(self, scene=self.recipe.prepared(raw, training), training=training, cutter=cutter)
 
     @contract
     def showing(self, scene: Gaussians) -> "Renderer":
