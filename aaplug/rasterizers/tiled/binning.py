@@ -65,6 +65,10 @@ class Bins:
     columns: int
     pairs: Pairs | None
 
+    def by_length(self) -> Int[Tensor, " t"]:
+        """The tiles by the length of their lists, the longest first."""
+        return stably_sorted(-self.counts.int())[1]
+
 
 @dataclass(frozen=True, eq=False)
 class TileBoxes:

@@ -24,7 +24,7 @@ from aaplug.core.kernels import EAGER, Kernel, Kernels, materialized
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, forms_at_corners, next_rows, tile_centres
-from aaplug.rasterizers.tiled.binning import Bins, stably_sorted
+from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With 8 the sums leave the registers
@@ -87,7 +87,7 @@ def composite_forward(
     rows: raster rows; the last one is the padding row.
     """
     local = how.centres(rows)
-    order = stably_sorted(-bins.counts.int())[1]
+    order = bins.by_length()
     filled = max(MIN_TILES, int((bins.counts > 0).sum()))
     planes = rows.new_zeros(how.channels + 1, min(filled + 1, len(order)), PIXELS)  # all empty tiles share the last
     tiles = order[:filled].tensor_split(-(-filled // how.kernels.tiles)) if len(order) else ()

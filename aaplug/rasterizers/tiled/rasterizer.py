@@ -25,7 +25,7 @@ from aaplug.core.splats import Render, Splats2D
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
-from aaplug.rasterizers.tiled.binning import MEMORY_BYTES, Bins, bands, stably_sorted
+from aaplug.rasterizers.tiled.binning import MEMORY_BYTES, Bins, bands
 from aaplug.rasterizers.tiled.forward import MIN_TILES, Compositing
 from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
@@ -102,7 +102,7 @@ class Tiled:
         local = tile_centres(rows)
 
         def paint(bins: Bins) -> tuple[Tensor, Tensor]:
-            order = stably_sorted(-bins.counts.int())[1]
+            order = bins.by_length()
             parts = []
             for tiles in order.split(MAX_BLENDED_TILES):
                 x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
