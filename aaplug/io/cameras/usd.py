@@ -77,9 +77,10 @@ def _check_layers(path: Path) -> None:
     """Refuse layers outside of the file's folder, whoever names them."""
     from aaplug.io.usd_child import layers_of  # its package is an extra
 
+    home = path.parent.resolve()
     try:
         for number, (asset, file) in enumerate(layers_of(str(path))):
-            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(path.parent.resolve()):
+            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(home):
                 raise FormatError(path, f"names a layer outside of its folder: {asset!r}")
             if number >= MAX_LAYERS:
                 raise FormatError(path, f"names more than {MAX_LAYERS} layers")
