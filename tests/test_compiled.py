@@ -7,6 +7,7 @@ import os
 import pickle
 import re
 import shutil
+import struct
 import sys
 import tempfile
 import threading
@@ -217,6 +218,28 @@ def test_a_compiler_gets_its_options_whatever_its_file_is_called(words, options,
     else:  # what clang compiles needs its OpenMP library, which another machine may lack
         with pytest.raises(UsageError, match=r"bundle: needs g\+\+"):
             compiled._configs(kernel, target)
+
+
+@linux
+def test_headers_are_precompiled_where_their_digest_can_be_computed(monkeypatch):
+    if compiled.PRECOMPILES not in torch._inductor.list_options():
+        pytest.skip("this torch precompiles no headers")
+    for path in (None, "/usr/bin/openssl"):
+        monkeypatch.setattr(shutil, "which", lambda name, path=path: path)
+        assert compiled._configs(binning.PAIRS).get(compiled.PRECOMPILES, True) == (path is not None)
+
+
+@linux
+def test_a_library_asks_for_no_executable_stack(built):
+    """glibc 2.41 loads no library that does, and a bundle may be compiled elsewhere."""
+    if not hasattr(torch._inductor.config.cpp, "march"):
+        pytest.skip("this torch does not tell a compiler its options")
+    segment_of_stack, executes = 0x6474E551, 1  # as elf(5) numbers them
+    content = compiled.package_path(binning.PAIRS).with_suffix(".so").read_bytes()
+    (start,), (size, count) = struct.unpack_from("<Q", content, 32), struct.unpack_from("<2H", content, 54)
+    segments = [struct.unpack_from("<2I", content, start + i * size) for i in range(count)]
+    [flags] = [flags for kind, flags in segments if kind == segment_of_stack]
+    assert not flags & executes
 
 
 def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, monkeypatch):

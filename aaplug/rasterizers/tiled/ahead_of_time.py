@@ -109,7 +109,8 @@ FOR_PROFILERS = ("aot_inductor.enable_frame_pointer", "aot_inductor.enable_line_
 # own processor, and results are compared; but a g++ can be too old for a processor's AMX.
 TRIED_OUT, MAYBE_TOO_NEW = "cpp.vec_isa_ok", "amx"
 # torch's headers are precompiled for each set of g++'s options: 10 s of a processor, and 3 s less for each kernel.
-PRECOMPILES = "aot_inductor.precompile_headers"
+# By their digest, which a program of this name computes.
+PRECOMPILES, DIGESTS = "aot_inductor.precompile_headers", "openssl"
 THIS_PROCESSOR = "native"  # as g++ calls its architecture
 # g++ orders instructions before it allocates registers, so that values overlap; with the second option it counts these.
 # They follow the architecture, the only setting whose text reaches g++.
@@ -121,6 +122,9 @@ WHOLE_VECTORS = "-mprefer-vector-width=512"
 # clang 14 takes inductor's last word on mathematics for an order to keep floating-point traps, unless another word
 # follows. It then neither joins a product and a sum nor moves them: passes take 1.8 times as long.
 CONTRACTING = "-fno-trapping-math"
+# Inductor's constants come as assembly that does not say whether the stack holds code. Many linkers then ask for an
+# executable stack, which glibc 2.41 refuses to make.
+PLAIN_STACK = "-Wa,--noexecstack"
 GNU, CLANG = "Free Software Foundation", "clang version"  # in a compiler's words about itself, whatever its file's name
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
@@ -197,7 +201,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
     target: None for this processor and compiler.
     """
     options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, FOR_PROFILERS)
-    options += (SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS, CONTRACTING)  # of compilers
+    options += (SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS, CONTRACTING, PLAIN_STACK)  # of compilers
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
     facts = (torch.__version__, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
@@ -491,7 +495,7 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
     from torch._inductor.config import cpp  # takes long
 
     configs = OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED_OPTIONS if kernel.chained else {})
-    where_known = dict.fromkeys(FOR_PROFILERS, False)
+    where_known = dict.fromkeys(FOR_PROFILERS, False) | ({} if shutil.which(DIGESTS) else {PRECOMPILES: False})
     x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     words = _compiler_version(_compiler())
@@ -499,7 +503,7 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
         capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
         wide = capability == MANY_REGISTERS
         options = SCHEDULING[kernel.keeps_sums or not wide] if GNU in words else CONTRACTING
-        march = f"{target.name if target else THIS_PROCESSOR} {options}" + f" {WHOLE_VECTORS}" * wide
+        march = f"{target.name if target else THIS_PROCESSOR} {options} {PLAIN_STACK}" + f" {WHOLE_VECTORS}" * wide
         configs |= {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
         where_known |= {TRIED_OUT: True} if MAYBE_TOO_NEW not in _processor() else {}
         where_known |= {PRECOMPILES: False} if kernel.keeps_sums and wide else {}
