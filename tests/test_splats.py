@@ -100,6 +100,14 @@ def test_whitening_is_a_square_root_of_the_inverse_covariance():
     inverse = torch.stack([yy, -xy, -xy, xx], dim=1) / splats.dets[:, None]
     white = whitening(splats)
     torch.testing.assert_close((white.mT @ white).flatten(1), inverse, rtol=1e-9, atol=1e-12)
+    assert not white[:, 1, 0].any()  # pixel kernels leave that product out
+
+
+@pytest.mark.parametrize("covariance", [(4.0, 0.0, 0.0), (0.0, 0.0, 4.0), (1e12, 0.0, 1e-12)])
+def test_whitening_of_an_ellipse_without_width_is_finite(covariance):
+    tiny = torch.finfo(torch.float32).tiny
+    edge = splat(*covariance, dtype=torch.float32)
+    assert whitening(replace(edge, dets=edge.dets.clamp(min=tiny))).isfinite().all()
 
 
 @pytest.mark.parametrize(("x", "y"), [(-0.9, 5.0), (40.9, 5.0), (5.0, -0.9), (5.0, 20.9)])

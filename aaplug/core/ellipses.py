@@ -29,20 +29,13 @@ def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
 def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
     """ux, uy, vx, vy: the rows of a matrix W with |W d|² = dᵀ C⁻¹ d, so that u = ux·dx + uy·dy, and v likewise.
 
-    W is triangular, up to the order of its columns: v depends only on the axis of larger variance, so u's slope
-    against it is at most 1.  With the given determinant a needle keeps its precision; expanding dᵀ C⁻¹ d cancels.
+    W is upper triangular: vx is 0, and v depends on dy alone.  With the given determinant a needle keeps its precision;
+    expanding dᵀ C⁻¹ d cancels.
     """
-    xx, xy, yy = covs.unbind(dim=1)
-    wide = xx >= yy
-    pivot = torch.where(wide, xx, yy)
-    along, across = pivot.rsqrt(), (pivot / dets).sqrt()
-    slope, zero = -xy / pivot * across, torch.zeros_like(along)
-    return (
-        torch.where(wide, slope, across),
-        torch.where(wide, across, slope),
-        torch.where(wide, along, zero),
-        torch.where(wide, zero, along),
-    )
+    _, xy, yy = covs.unbind(dim=1)
+    yy = yy.clamp(min=torch.finfo(yy.dtype).tiny)  # of a disc on edge
+    across = yy.sqrt() / dets.sqrt()  # their quotient may be too large
+    return across, -xy / yy * across, torch.zeros_like(across), yy.rsqrt()
 
 
 def squared_cutoff(

@@ -58,7 +58,7 @@ class Point:
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off."""
-        u, v = forms_at(rows, pixels)
+        u, v = forms_at(rows, pixels, triangular=True)
         h = torch.addcmul(rows[..., OPACITY, None], u, u, value=-1)
         return exp2_of(torch.addcmul(h, v, v, value=-1), limits)
 
@@ -84,7 +84,7 @@ class Point:
         for row, pixels, weight, gradient in moves:
             # Both are 0 where T is 0, but the test on T makes the compiler fuse all sums into one loop.
             gradient, weight = (torch.where(T > 0, x, 0.0) for x in (gradient, weight))
-            u, v = forms_at(row, pixels)
+            u, v = forms_at(row, pixels, triangular=True)
             su, sv = gradient * u, gradient * v
             sums += [su * u, su * v, sv * v, su, sv, gradient, *(weight * colour for colour in colours)]
             sums += self.further_terms(row, gradient, (u, v))

@@ -45,13 +45,20 @@ def tile_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]
     return x.flatten(), y.flatten()
 
 
-def forms_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
-    """The two linear forms of splats at pixel centres."""
+def forms_at(
+    row: Float[Tensor, "*n t c"], pixels: Pixels, triangular: bool = False
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """The two linear forms of splats at pixel centres.
+
+    triangular: v depends on y alone, as `whitening_columns` makes it.
+    """
     at_corners = pixels.at_corners or forms_at_corners(row, pixels.corners)
     forms = [(row[..., i], row[..., j], k) for (i, j), k in zip(FORMS, at_corners, strict=True)]
     if torch.compiler.is_compiling():
         columns = [[x[..., None] for x in form] for form in forms]
-        u, v = (torch.addcmul(torch.addcmul(k, j, pixels.y), i, pixels.x) for i, j, k in columns)
+        u, v = (torch.addcmul(k, j, pixels.y) for _, j, k in columns)
+        u = torch.addcmul(u, columns[0][0], pixels.x)
+        v = v if triangular else torch.addcmul(v, columns[1][0], pixels.x)
     else:  # eagerly a matrix product is faster than any operation per pixel
         basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
         u, v = (torch.stack(form, dim=-1) @ basis for form in forms)

@@ -104,7 +104,7 @@ class Surfel:
 
 def plane_coordinates(rows: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     """Where pixels' rays meet the discs, s and t, by the forms of the raster rows; and 1/w."""
-    u, v = forms_at(rows, pixels)
+    u, v = forms_at(rows, pixels, triangular=True)
     dx, dy = offsets_at(rows, pixels)
     inverse = 1 / (1 - rows[..., SLOPE_X, None] * dx - rows[..., SLOPE_Y, None] * dy).clamp(min=IN_FRONT)
     return u * inverse, v * inverse, inverse
