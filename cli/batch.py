@@ -38,6 +38,13 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
 )
 
 
+def refuse_without_batch(words: Words, *names: str) -> None:
+    """Raise UsageError if one of these options was given: they belong to a batch."""
+    for name in names:
+        if words.values[name]:
+            raise UsageError(name, "belongs to --batch")
+
+
 def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
     """Evaluate every scene that a batch file or the command line names, or of a protocol's data set in a folder."""
     from aaplug.evaluation.data_sets import find_scenes

@@ -13,7 +13,7 @@ from aaplug.options.base import REPORT, Options, as_path, flag, names, number
 from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
-from .batch import BATCH, SEVERAL, batch_of_evaluations, for_each_scene
+from .batch import BATCH, SEVERAL, batch_of_evaluations, for_each_scene, refuse_without_batch
 from .console import TERMINAL, say, table
 from .inputs import (
     SCENE_AND_CAMERAS,
@@ -87,8 +87,7 @@ def convert(words: Words) -> Answer:
     """
     if words.batch is not None:
         return for_each_scene(words, lambda scene: ".ply", lambda scene: scene.output.is_file())
-    if words.resume:
-        raise UsageError("resume", "belongs to --batch")
+    refuse_without_batch(words, "resume", "scheduler")
     inputs = read_inputs(words)
     result = aaplug.convert(*inputs, words.output, **told(words, verbs.ConvertOptions))
     from aaplug.evaluation.results import tables
@@ -127,6 +126,7 @@ def lod(words: Words) -> Answer:
             lambda scene: ".ply" if scene.of(verbs.LodOptions).single else "",
             lambda scene: is_made(scene.output, scene.of(verbs.LodOptions)),
         )
+    refuse_without_batch(words, "scheduler")
     scene, cameras = read_inputs(words)
     levels = aaplug.lod(scene, cameras, words.output, **told(words, verbs.LodOptions))
     *finer, last = (len(level.scene) for level in levels)

@@ -143,6 +143,8 @@ REFUSED = {
     f"{EVALUATE} --metric lpips:alex": ["--lpips"],
     f"{LOD} -o x.ply --simplify 1000": ["--simplify: asks for 1,000 Gaussians, and the scene has 150"],
     f"{LOD} -o x.ply --simplify 0.5 --levels 2": ["--levels: cannot be combined with --simplify"],
+    f"{LOD} -o new --scheduler local": ["--scheduler: belongs to --batch"],
+    f"{CONVERT} --scheduler local --overwrite": ["--scheduler: belongs to --batch"],
     f"{LOD} -o x.ply": ["x.ply: levels go to a folder; for one scene, give --simplify or --budget"],
     f"{LOD} -o x.obj --simplify 0.5": ["has no suffix of a format that can be written"],
     f"{LOD} -o scene.ply --simplify 0.5 --overwrite": ["is also the input"],
