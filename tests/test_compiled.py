@@ -209,8 +209,11 @@ def test_a_compiler_gets_its_options_whatever_its_file_is_called(words, options,
         pytest.skip("this torch does not tell a compiler the architecture")
     monkeypatch.setenv("CXX", "/opt/conda/bin/x86_64-conda-linux-gnu-c++")
     monkeypatch.setattr(compiled, "_compiler_version", lambda compiler: words)
+    monkeypatch.setattr(compiled, "_processor", lambda: "amx_tile")
     kernel, (target, *_) = forward.pass_kernel(point.POINT), compiled.TARGETS
-    march = compiled._configs(kernel).get("cpp.march", "")
+    configs = compiled._configs(kernel)
+    march = configs.get("cpp.march", "")
+    assert configs.get(compiled.TRIED_OUT, False) == bool(options)
     assert march.startswith("native" if options else "")
     assert options in march
     if "Free" in words:

@@ -106,8 +106,8 @@ CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
 # What only profilers read, where torch knows these settings: three quarters of a package, a tenth of compiling.
 FOR_PROFILERS = ("aot_inductor.enable_frame_pointer", "aot_inductor.enable_line_tables")
 # Inductor tries out which of the processor's instruction sets compile and load, for 8 s of a processor.  g++ knows its
-# own processor, and results are compared; but a g++ can be too old for a processor's AMX.
-TRIED_OUT, MAYBE_TOO_NEW = "cpp.vec_isa_ok", "amx"
+# own processor, and results are compared.  What a g++ can be too old for, such as AMX, is still tried out, by itself.
+TRIED_OUT = "cpp.vec_isa_ok"
 # torch's headers are precompiled for each set of g++'s options: 10 s of a processor, and 3 s less for each kernel.
 # By their digest, which a program of this name computes.
 PRECOMPILES, DIGESTS = "aot_inductor.precompile_headers", "openssl"
@@ -505,8 +505,7 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
         options = SCHEDULING[kernel.keeps_sums or not wide] if GNU in words else CONTRACTING
         march = f"{target.name if target else THIS_PROCESSOR} {options} {PLAIN_STACK}" + f" {WHOLE_VECTORS}" * wide
         configs |= {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
-        where_known |= {TRIED_OUT: True} if MAYBE_TOO_NEW not in _processor() else {}
-        where_known |= {PRECOMPILES: False} if kernel.keeps_sums and wide else {}
+        where_known |= {TRIED_OUT: True} | ({PRECOMPILES: False} if kernel.keeps_sums and wide else {})
     elif target is not None:
         raise UsageError("bundle", f"needs {STANDARD_COMPILER} and a torch that tells it the architecture")
     known = torch._inductor.list_options()
