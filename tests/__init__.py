@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, wraps
-from typing import Any
+from typing import Any, get_args
 
 import jaxtyping
 
@@ -28,6 +28,12 @@ def check_again() -> None:
     """Check the calls of another test."""
     global _test
     _test += 1
+
+
+def _has_shapes(hint: Any) -> bool:
+    """True for arrays, whatever holds them, and for names, of which that is not known."""
+    arrays = isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray)
+    return arrays or isinstance(hint, str) or any(map(_has_shapes, get_args(hint)))
 
 
 def limited(jaxtyped: Callable[..., Any]) -> Callable[..., Any]:
@@ -45,10 +51,14 @@ def limited(jaxtyped: Callable[..., Any]) -> Callable[..., Any]:
             nonlocal checked, test, left
             if test != _test:
                 test, left = _test, CHECKED_CALLS
-            if not left:
+            if not left or jaxtyping.config.jaxtyping_disable:
                 return function(*args, **options)
             left -= 1
-            checked = checked or jaxtyped(function, typechecker=typechecker)  # most functions are called by few tests
+            if checked is None:  # most functions are called by few tests
+                shaped = any(map(_has_shapes, function.__annotations__.values()))
+                generates = inspect.isgeneratorfunction(function)
+                plain = not shaped and not generates  # beartype alone takes a 25th of the time
+                checked = typechecker(function) if plain else jaxtyped(function, typechecker=typechecker)
             return checked(*args, **options)
 
         return call

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import gc
 import json
 import logging
 import math
@@ -62,6 +63,11 @@ def pytest_configure() -> None:
     """Test processes run side by side; threads that wait for each other, or for the disk, would stall them all."""
     torch.set_num_threads(1)
     os.fsync = lambda descriptor: None  # no test pulls the plug
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: searches for garbage, and pytest's five at the end, leave it out."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,7 @@
 """The library gives what the command line gives: same names, defaults and images."""
 
 import inspect
+import json
 import re
 import runpy
 import tomllib
@@ -12,7 +13,9 @@ from aaplug_cli.verbs import VERBS
 
 import aaplug
 from aaplug.system.errors import UsageError
-from tests.conftest import ROOT, SAMPLE
+from tests.conftest import ROOT, SAMPLE, run_python
+
+LEAST_WRONG_CALLS = 3000
 
 
 def test_python_in_the_readme_gives_the_command_lines_image(cli):
@@ -83,3 +86,12 @@ def test_the_sample_is_small_and_tells_its_origin():
     files = [path for path in SAMPLE.rglob("*") if path.suffix in {".ply", ".json", ".png", ".md"}]
     assert sum(path.stat().st_size for path in files) < 6e6
     assert "CC0" in (SAMPLE / "ORIGIN.md").read_text()
+
+
+def test_every_public_function_refuses_wrong_values_at_once_and_in_our_words():
+    ends = json.loads(run_python("from tests.wrong_calls import main; main()").stdout)
+    assert ends["calls"] >= LEAST_WRONG_CALLS
+    assert not ends["forgotten"], "functions that are not called"
+    assert not ends["raw"], "errors of another library"
+    assert not ends["passed"], "a stranger was taken"
+    assert not ends["slow"], "a second or more"

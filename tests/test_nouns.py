@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from beartype.roar import BeartypeCallHintParamViolation
 from jaxtyping import TypeCheckError
 
 from aaplug.core.cameras import CameraSet, look_at
@@ -24,7 +25,7 @@ from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.scenes import read_scene, scene_of, write_scene
 from aaplug.methods import RECIPES
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, listing
 from aaplug.verbs.render import Written
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
@@ -224,7 +225,9 @@ def test_a_name_that_a_registry_lacks_is_a_key_error_and_ours():
 
 
 @pytest.mark.parametrize("test", ["one", "another"])
-def test_shapes_are_checked_in_every_test(test):
+def test_types_and_shapes_are_checked_in_every_test(test):
+    with pytest.raises(BeartypeCallHintParamViolation):
+        listing(3)
     with pytest.raises(TypeCheckError):
         replace(make_splats(6, (8, 8)), depths=torch.zeros(5))
     with pytest.raises(TypeCheckError):

@@ -6,13 +6,14 @@ It is run as a program, outside of pytest, whose checks of types would raise bef
 import inspect
 import json
 import math
+import os
 import sys
 import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, chdir
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +27,7 @@ from aaplug.evaluation.laws.base import make_camera, make_scene, make_splats
 from aaplug.gsplat import rasterization, rasterization_2dgs
 from aaplug.system.errors import AaplugError
 
+signature_of = cache(inspect.signature)  # takes longer than many of the calls
 STRANGERS = (object(), 2j)  # which no parameter takes
 ODD_VALUES = (
     None, True, 0, 1, -1, 7, 10**30, 0.0, 0.5, -0.5, 1e30, math.nan, math.inf, -math.inf, "", "nope", "5x5",
@@ -58,7 +60,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     aaplug.write_png(picture, rgb, overwrite=True)
 
     def fields(noun: Any) -> dict[str, Any]:
-        return {name: value for name, value in vars(noun).items() if name in inspect.signature(type(noun)).parameters}
+        return {name: value for name, value in vars(noun).items() if name in signature_of(type(noun)).parameters}
 
     aperture = aaplug.Aperture(0.1, 3.0)
     exposure = aaplug.Exposure(aperture, (view, view), 2)
@@ -160,7 +162,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     calls |= {f"{type(noun).__name__}.{name}": (getattr(noun, name), right) for name, (noun, right) in methods.items()}
     for noun in (gaussians, splats, aaplug.RECIPES):
         index = "matched" if noun is aaplug.RECIPES else slice(2)
-        name = next(iter(inspect.signature(noun.__getitem__).parameters))
+        name = next(iter(signature_of(noun.__getitem__).parameters))
         calls[f"{type(noun).__name__}[]"] = (noun.__getitem__, {name: index})
     return calls
 
@@ -192,10 +194,10 @@ def empty_ones(noun: Any) -> list[Any]:
 def wrong_calls(folder: Path) -> Iterator[tuple[str, str, Any, bool, Callable[[], Any]]]:
     """Yield (function, parameter, value, whether it must be refused, call) of each call."""
     for name, (function, right) in right_calls(folder).items():
-        for number, (parameter, spec) in enumerate(inspect.signature(function).parameters.items()):
+        for number, (parameter, spec) in enumerate(signature_of(function).parameters.items()):
             if spec.kind in (spec.VAR_KEYWORD, spec.VAR_POSITIONAL):
                 continue
-            thin = spec.kind is spec.KEYWORD_ONLY and len(inspect.signature(function).parameters) > MANY
+            thin = spec.kind is spec.KEYWORD_ONLY and len(signature_of(function).parameters) > MANY
             values = list(ODD_VALUES[number % THIN :: THIN] if thin else ODD_VALUES) + empty_ones(right.get(parameter))
             unfit = list(STRANGERS)
             if isinstance(right.get(parameter), Tensor):
@@ -210,35 +212,40 @@ def wrong_calls(folder: Path) -> Iterator[tuple[str, str, Any, bool, Callable[[]
 
 def call(function: Callable[..., Any], given: dict[str, Any]) -> None:
     """Call a function, also where its parameters have no keywords; a context manager is entered too."""
-    positional = [given[n] for n, p in inspect.signature(function).parameters.items() if p.kind is p.POSITIONAL_ONLY]
+    positional = [given[n] for n, p in signature_of(function).parameters.items() if p.kind is p.POSITIONAL_ONLY]
     result = function(*positional) if positional else function(**given)
     if isinstance(result, AbstractContextManager):
         with result:
             pass
 
 
+def words_of(name: str, parameter: str, value: Any) -> str:
+    """The call in a message."""
+    return f"{name}({parameter}={str(value)[:40]!r} {type(value).__name__})"
+
+
 def main() -> None:
     """Make all calls; print their number, raw errors, slow calls, strangers let pass, and functions not called."""
     torch.set_num_threads(1)
+    os.fsync = lambda descriptor: None  # as in conftest.py
     warnings.simplefilter("ignore")
     said: dict[str, list[str]] = {"raw": [], "slow": [], "passed": []}
     ends: Counter[str] = Counter()
     with TemporaryDirectory() as folder, chdir(folder):
         functions = set(right_calls(Path(folder)))
         for name, parameter, value, refused, do in wrong_calls(Path(folder)):
-            what = f"{name}({parameter}={str(value)[:40]!r} {type(value).__name__})"
             start = time.thread_time()
             try:
                 do()
                 ends["let pass"] += 1
                 if refused:
-                    said["passed"].append(what)
+                    said["passed"].append(words_of(name, parameter, value))
             except AaplugError:
                 ends["refused"] += 1
             except Exception as error:
-                said["raw"].append(f"{what}: {type(error).__name__}: {str(error)[:80]}")
+                said["raw"].append(f"{words_of(name, parameter, value)}: {type(error).__name__}: {str(error)[:80]}")
             if time.thread_time() - start > 1:
-                said["slow"].append(what)
+                said["slow"].append(words_of(name, parameter, value))
     callables = {
         n
         for n in aaplug.__all__

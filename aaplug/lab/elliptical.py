@@ -79,14 +79,19 @@ class Elliptical(Integral):
         half = 0.5 * splats.window
         nodes, kappa = self.nodes(splats)
         value, total = torch.zeros_like(offsets[..., 0]), torch.zeros_like(nodes)
-        for i in range(MOST_NODES):
-            for j in range(MOST_NODES):
+        places = [(2 * k + 1) / nodes - 1 for k in range(MOST_NODES)]
+        along_u, along_v = (
+            [torch.exp(-0.5 * (x + place * reach).square()) for place in places]
+            for x, reach in (
+                (ux * offsets[..., 0] + uy * offsets[..., 1], half * torch.hypot(ux, uy)),
+                (vx * offsets[..., 0] + vy * offsets[..., 1], half * torch.hypot(vx, vy)),
+            )
+        )
+        for i, s in enumerate(places):
+            for j, t in enumerate(places):
                 used = (i < nodes) & (j < nodes)
-                s, t = ((2 * k + 1) / nodes - 1 for k in (i, j))
                 weight = self.weight(0.5 * (1 - torch.maximum(s.abs(), t.abs())), splats.window) * used
-                u = ux * offsets[..., 0] + uy * offsets[..., 1] + s * half * torch.hypot(ux, uy)
-                v = vx * offsets[..., 0] + vy * offsets[..., 1] + t * half * torch.hypot(vx, vy)
-                value, total = value + weight * torch.exp(-0.5 * (u * u + v * v)), total + weight
+                value, total = value + weight * along_u[i] * along_v[j], total + weight
         return value / total if self.normalized else value * (1 + self.gamma * kappa.log()) / nodes**2
 
     def nodes(self, splats: Splats2D) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
