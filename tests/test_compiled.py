@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import CodeType
 from unittest.mock import Mock
 
 import pytest
@@ -33,7 +34,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rasterizers import RASTERIZERS, choice
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages
+from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages, sources
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
@@ -504,6 +505,23 @@ def test_other_options_compilers_and_processors_have_other_packages(monkeypatch,
     before = paths()
     monkeypatch.setattr(compiled, name, value)
     assert not {*before.values()} & {*paths().values()}
+
+
+def test_a_bundle_serves_every_python_and_every_build_of_its_torch(monkeypatch):
+    def bundled() -> dict[str, str]:
+        paths = {kernel.name: compiled._path_in(CACHE, kernel, compiled.TARGETS[0]) for kernel in ALL_KERNELS}
+        return {name: path.name for name, path in paths.items()}
+
+    def in_another_order(code: CodeType) -> tuple[str, ...]:
+        return names_of(code)[::-1]
+
+    before, names_of, [version, *_] = bundled(), sources._names, torch.__version__.split("+")
+    monkeypatch.setattr(sources, "_names", in_another_order)
+    assert bundled() == before
+    monkeypatch.setattr(torch, "__version__", f"{version}+another")
+    assert bundled() == before
+    monkeypatch.setattr(torch, "__version__", f"{version}.1")
+    assert not {*before.values()} & {*bundled().values()}
 
 
 def test_a_compiler_that_does_not_run_has_no_version():

@@ -249,8 +249,9 @@ def composited(
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_images_equal_the_formula(mode, channels):
     values, views = gaussians() | {"colors": torch.rand(40, channels, dtype=F64)}, two_views()
-    # two opaque splats, each in the middle of one image
+    # two opaque bright splats, each in the middle of one image
     values["means"][:2], values["opacities"][:2], values["scales"][:2] = 0.5 * torch.tensor(EYES), 1.0, 0.2
+    values["colors"][:2] = 1.0
     image, alpha, meta = rasterization(**values, **views, packed=False, rasterize_mode=mode)
     assert image.shape == (2, SIZE[1], SIZE[0], channels)
     for camera in range(2):

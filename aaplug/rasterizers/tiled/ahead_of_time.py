@@ -198,12 +198,13 @@ def targets() -> tuple[Target, ...]:
 def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path:
     """The file of a kernel's package for its present sources and this torch, in a folder.
 
-    target: None for this processor and compiler.
+    target: None for this processor and compiler.  With one, torch's builds for CPUs and for CUDA share the package.
     """
     options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, FOR_PROFILERS)
     options += (SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS, CONTRACTING, PLAIN_STACK)  # of compilers
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
-    facts = (torch.__version__, options, *machine, sources_of(kernel))
+    version = torch.__version__ if target is None else torch.__version__.partition("+")[0]
+    facts = (version, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
     return folder / f"{kernel.name}-{key}.pt2"
 

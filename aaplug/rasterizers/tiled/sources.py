@@ -33,7 +33,7 @@ def sources_of(kernel: Kernel) -> str:
     """Return the text of all that the package of a kernel is made of."""
     fields = {name: value for name, value in vars(kernel).items() if name not in ("function", "example")}
     reached = [*_reached(kernel.function, classes=True), *_reached(kernel.example, classes=False)]
-    return "\n".join([repr(fields), *reached])
+    return "\n".join([repr(fields), *sorted(reached)])  # code of each Python names what it uses in another order
 
 
 def _reached(start: Any, classes: bool) -> Iterator[str]:
