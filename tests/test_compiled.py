@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import CodeType
@@ -382,14 +382,31 @@ def test_a_damaged_or_foreign_package_is_left_aside_with_one_line(copied_cache, 
 
 @pytest.mark.parametrize(
     ("name", "error"),
-    [("scratch", OSError(errno.EROFS, "read-only file system")), ("_opened", OSError("failed to map segment"))],
+    [
+        ("scratch", OSError(errno.EROFS, "read-only file system", "/home/caches")),
+        ("_opened", OSError("failed to map segment")),
+        ("_opened", OSError("version `GLIBC_2.38' not found")),
+    ],
 )
 def test_a_cache_that_cannot_be_used_means_eager_images_and_one_line(copied_cache, monkeypatch, caplog, name, error):
-    """A read-only folder, and one that does not allow programs to run."""
+    """A read-only folder, one that does not allow programs to run, and a bundle of a newer system."""
     monkeypatch.setattr(compiled, name, Mock(side_effect=error))
     assert find_rasterizer("auto") is RASTERIZERS["eager"]
     [line] = caplog.messages
-    assert str(error.strerror or error) in line
+    assert (f"{error.filename}: {error.strerror}" if error.filename else str(error)) in line
+
+
+def test_a_cache_that_may_not_be_looked_into_is_an_empty_one(empty_cache, monkeypatch):
+    """As that of HOME=/root is to other accounts."""
+
+    def denied(path: str | Path, real: Callable[..., object] = os.stat, **how: object) -> object:
+        if str(path).startswith(str(empty_cache)):
+            raise PermissionError(errno.EACCES, "permission denied", str(path))
+        return real(path, **how)
+
+    monkeypatch.setattr(os, "stat", denied)
+    assert find_rasterizer("auto", 1) is RASTERIZERS["eager"]
+    assert not compiled.is_built(binning.PAIRS)
 
 
 PIXELS_AND_SELECTIONS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
@@ -599,7 +616,7 @@ def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, c
     said: list[str] = []
     assert find_rasterizer("auto", 1, said.append) is RASTERIZERS["eager"]
     assert len(said) == 1
-    assert "AAPLUG_KERNELS names /nowhere, which has no kernels" in said[0]
+    assert f"AAPLUG_KERNELS names /nowhere, which has no kernels for torch {torch.__version__}" in said[0]
     assert ("warmup" if compiler else "no C++ compiler") in said[0]
 
 

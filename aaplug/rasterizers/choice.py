@@ -3,6 +3,8 @@
 import os
 from collections.abc import Callable
 
+import torch
+
 from aaplug.core.interfaces import PixelKernel, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.methods.pixel_kernels.point import POINT
@@ -73,6 +75,7 @@ def find_rasterizer(
         problem = "`aaplug warmup` compiles it, several times as fast"
         problem = problem if has_compiler() else "no C++ compiler found to compile it"
         if bundle := os.environ.get(BUNDLE_VARIABLE):
-            problem = f"{BUNDLE_VARIABLE} names {bundle}, which has no kernels for this torch and processor; {problem}"
+            here = f"torch {torch.__version__} on this machine"
+            problem = f"{BUNDLE_VARIABLE} names {bundle}, which has no kernels for {here}; {problem}"
     say(f"rasterizer: eager ({problem})")
     return RASTERIZERS["eager"]

@@ -97,9 +97,12 @@ def printable(text: str) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The reason of a failure of a library or the system, in lower case: an OSError's without its number and path."""
-    strerror = error.strerror if isinstance(error, OSError) else None
-    return (strerror or str(error)).lower()
+    """The reason of a failure of a library or the system, as part of a sentence: an OSError's without number and path.
+
+    Its first word is in lower case; names of files and symbols inside keep their case.
+    """
+    words = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return words[:1].lower() + words[1:] if words[1:2].islower() else words
 
 
 def failure(error: BaseException, package: str) -> str:

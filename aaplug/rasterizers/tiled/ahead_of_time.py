@@ -28,6 +28,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from os.path import isfile  # false, where `Path.is_file` raises, in a folder that this user may not look into
 from pathlib import Path
 from typing import Any
 
@@ -182,9 +183,9 @@ def cache_folder() -> Path:
 def package_path(kernel: Kernel) -> Path:
     """The file of a kernel's package: the one compiled on this machine, or where there is none a bundle's."""
     path, bundle = _path_in(cache_folder(), kernel), os.environ.get(BUNDLE_VARIABLE)
-    if bundle and not path.is_file():
+    if bundle and not isfile(path):
         packages = (_path_in(Path(bundle), kernel, target) for target in targets())
-        return next(filter(Path.is_file, packages), path)
+        return next(filter(isfile, packages), path)
     return path
 
 
@@ -211,7 +212,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
 
 def is_built(kernel: Kernel) -> bool:
     """True if a package of this kernel, sound or not, is in the cache."""
-    return package_path(kernel).is_file()
+    return isfile(package_path(kernel))
 
 
 def has_compiler() -> bool:
@@ -357,7 +358,7 @@ def package_of(kernel: Kernel) -> Package | None:
     try:
         return Package.of(_compared(kernel, path), kernel)
     except UsageError as error:
-        if path.exists():
+        if isfile(path):
             _warn(path, error.problem)
         return None
 
@@ -411,7 +412,8 @@ def _compared(kernel: Kernel, package: Path) -> Run:
         raise
     except Exception as error:  # a broken library can fail in any way
         [problem, *_] = reason(error).splitlines() or [type(error).__name__]
-        raise UsageError(f"kernel {kernel.name}", f"cannot be used: {problem}") from error
+        file = getattr(error, "filename", None)  # most often in the cache, which a bundle's user may not write to
+        raise UsageError(f"kernel {kernel.name}", f"cannot be used: {f'{file}: ' * bool(file)}{problem}") from error
 
 
 @contextmanager
