@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -77,10 +78,21 @@ def line_of(process: subprocess.Popen[str], said: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def local() -> Iterator[Any]:
-    """A cluster of one process of this machine."""
-    with cluster.connected("local", 1, None, Counting()) as processes:
-        yield processes
+def started_locally(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A cluster of one process of this machine, which leaves no temporary file."""
+    temporary = tmp_path_factory.mktemp("temporary")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(temporary))
+        with cluster.connected("local", 1, None, Counting()) as processes:
+            yield processes
+    assert not [*temporary.iterdir()]
+
+
+@pytest.fixture
+def local(started_locally: Any) -> Any:
+    """That cluster, whose process is there; another test may have killed it."""
+    started_locally.client.wait_for_workers(1)
+    return started_locally
 
 
 def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
@@ -142,6 +154,7 @@ def test_images_and_videos_are_the_same(local, cli, monkeypatch):
         aaplug.video("scene.ply", ".", f"{folder}/v.webm", seconds=0.1, beside=None, **how)
         return [path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()]
 
+    local.monitor.workers.clear()  # another test may have killed the one
     assert made("out", scheduler=local) == made("one")
     assert local.monitor.workers == {1}
 
@@ -155,7 +168,6 @@ def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local)
 
 
 def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
-    local.client.wait_for_workers(1)  # another test may have killed it
     monkeypatch.setitem(cluster.VERSIONS, "aaplug", "9.9")
     found = rf"worker tcp://127\.0\.0\.1:\d+: has aaplug {version('aaplug')}, expected 9\.9; install that there"
     with pytest.raises(UsageError, match=found):
@@ -183,7 +195,6 @@ def answering(text: bytes) -> Iterator[str]:
 
 
 def test_what_answers_and_is_no_scheduler_is_told(local, tmp_path, monkeypatch):
-    local.client.wait_for_workers(1)  # another test may have killed it
     with answering(b"") as silent, answering(b"HTTP/1.0") as page:
         for address, problem, seconds in (
             (page, "what answers there is not Dask", cluster.ANSWER_SECONDS),

@@ -9,7 +9,8 @@ import torch
 
 import aaplug
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.evaluation.results import mean
+from aaplug.evaluation.metrics import PSNR
+from aaplug.evaluation.results import figure_of, mean
 from aaplug.finetuning.poses import moved_by, refine_pose
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
@@ -124,5 +125,5 @@ def test_finetune_refines_poses_first(photographed, monkeypatch):
     errors = []
     for poses in (False, True):
         tuned = aaplug.finetune(scene, CameraSet(off, off), None, poses=poses, **how)
-        errors.append(tuned.as_json()["before@1"]["PSNR"])
+        errors.append(figure_of(PSNR, tuned.report.select("before", 1.0)))
     assert errors[1] > errors[0] + 6

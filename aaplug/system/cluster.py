@@ -216,14 +216,13 @@ def _local(workers: int, folder: Path) -> LocalCluster:
     """Processes of this machine, each with one thread and as much memory as there is."""
     track_quietly()
     try:
-        with dask.config.set(LEAN_WORKERS):
+        with dask.config.set({**LEAN_WORKERS, "temporary-directory": str(folder)}):
             return LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 dashboard_address=cast(str, None),
                 memory_limit=0,
                 silence_logs=logging.CRITICAL,
-                local_directory=str(folder),
                 preload=[IGNORE_INTERRUPTS],
             )
     except RuntimeError as error:
