@@ -66,7 +66,7 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What was imported stays: searches for garbage, and pytest's five at the end, leave it out."""
+    """Leave all that was imported out of searches for garbage, and of pytest's five at the end."""
     gc.freeze()
 
 
