@@ -3,7 +3,7 @@
 import itertools
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -11,12 +11,14 @@ import torch
 import aaplug
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, CameraSet, Exposure
-from aaplug.core.exposures import cells, lattice, opening, sample_cameras, spread
+from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras, spread, spread_out
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
+from aaplug.core.splats import Render
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
 from aaplug.options.shared import FilmOptions
+from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
@@ -97,13 +99,15 @@ def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion
 @pytest.mark.parametrize("samples", [1, 7])
 @pytest.mark.parametrize("aperture", [None, APERTURE], ids=["pinhole", "aperture"])
 @pytest.mark.parametrize("motion", [None, (VIEW, VIEW), (VIEW, MOVED)], ids=["no shutter", "still", "moved"])
-def test_gradients_of_a_cell_are_finite_differences(aperture, motion, samples):
+def test_gradients_of_what_a_cell_spreads_are_finite_differences(aperture, motion, samples):
     scene, camera = make_scene(30, dtype=torch.float64), exposed(aperture, motion, samples)
     weights, step = (torch.rand(2, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5) * 1e-6
 
     def total(means):
         splats = project(replace(scene, means=means), camera)
-        return (cells(splats, camera) * weights[splats.sources]).sum() / 1e-6
+        wide, opacities = spread_out(splats, camera, torch.full_like(splats.dets, 0.5))
+        of_each = (wide.covs * weights[wide.sources]).sum() + (opacities * weights[splats.sources, 0]).sum()
+        return (of_each + (wide.opacities * weights[wide.sources, 1]).sum()) / 1e-6
 
     means = scene.means.clone().requires_grad_()
     total(means).backward()
@@ -130,22 +134,23 @@ def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
 
 
 def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():
-    """Splats take half of them and, where their paths are longer than four of their widths, less."""
     splats = project(make_scene(30), VIEW)
-    splats = replace(splats, covs=splats.covs * torch.logspace(0, -6, len(splats))[:, None])
+    round_cells, whole = (cells(splats, exposed(APERTURE, None, n)) for n in (16, 1))
+    disc, line = spread(splats, exposed(APERTURE)), spread(splats, exposed(None, (VIEW, MOVED)))
+    assert torch.allclose(whole, disc, rtol=1e-3, atol=1e-6)
+    assert torch.allclose(round_cells, disc / 16, rtol=1e-3, atol=1e-6)
+    assert torch.allclose(cells(splats, exposed(None, (VIEW, MOVED))), line / 256, rtol=0.02, atol=1e-3)
 
-    def share(path: torch.Tensor) -> torch.Tensor:
-        ratio = (splats.covs[:, ::2].sum(dim=1) / path[:, ::2].sum(dim=1)).sqrt().double()
-        assert 0 < int((ratio < 1 / 4).sum()) < len(ratio)
-        return torch.where(ratio < 1 / 4, 2 * ratio, 0.5)[:, None]
 
-    round_cells, whole = (cells(splats, exposed(APERTURE, None, n)).double() for n in (16, 1))
-    disc = spread(splats, exposed(APERTURE)).double()
-    assert torch.allclose(whole, share(disc) * disc, rtol=1e-3, atol=1e-6)
-    assert torch.allclose(round_cells, share(disc) * disc / 16, rtol=1e-3, atol=1e-6)
-    line = spread(splats, exposed(None, (VIEW, MOVED))).double()
-    along = cells(splats, exposed(None, (VIEW, MOVED))).double()
-    assert torch.allclose(along, share(line) * line / 256, rtol=0.02, atol=1e-3)
+@pytest.mark.parametrize("light", [1.0, 0.2])
+def test_of_faint_spread_splats_some_are_drawn_with_the_light_of_all(light):
+    splats, camera = project(make_scene(300), VIEW), exposed(Aperture(1.0, 2.0), None, 1)
+    wide, opacities = spread_out(splats, camera, torch.full_like(splats.dets, light))
+    assert 0 < len(wide) < len(splats)
+    assert float(wide.opacities.min()) > 0.99 * min(FAINT, float(splats.opacities.min()))
+    assert float(wide.opacities.sum()) == pytest.approx(float(opacities.sum()), abs=2 * FAINT)
+    ratio = (splats.dets / splats.convolved(0.75 * cells(splats, camera), False).dets).sqrt()
+    assert torch.allclose(opacities, splats.opacities * ratio * light ** (1 - ratio), rtol=1e-4)
 
 
 def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(monkeypatch):
@@ -153,13 +158,63 @@ def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(mo
     renderer = aaplug.Renderer.of(scene, [VIEW], "matched", min_seen=0.0)
     many = renderer(exposed(APERTURE, (VIEW, MOVED), 100)).rgb
     few, one = (renderer(exposed(APERTURE, (VIEW, MOVED), n)).rgb for n in (16, 1))
-    monkeypatch.setattr("aaplug.rendering.renderer.cells", lambda splats, camera: torch.zeros_like(splats.covs))
+    monkeypatch.setattr("aaplug.core.exposures.cells", lambda splats, camera: torch.zeros_like(splats.covs))
     plain, pinhole = renderer(exposed(APERTURE, (VIEW, MOVED), 16)).rgb, renderer(toward(VIEW, MOVED, 0.5)).rgb
     figures = [psnr(image, many) for image in (few, plain, one, pinhole)]
     assert figures[0] > 36
     assert figures[0] > figures[1]
     assert figures[2] > 26
     assert figures[2] > figures[3] + 2
+
+
+def walls() -> aaplug.Gaussians:
+    """A red wall of many splats, a blue one close behind it that is hidden, and a green one far behind, to one side."""
+    side = torch.linspace(-1.0, 1.0, 21)
+    x, z = (axis.flatten() for axis in torch.meshgrid(side, side, indexing="ij"))
+    parts = [torch.stack([0.5 * x, torch.full_like(x, y), 0.5 * z], dim=1) for y in (0.0, 0.1)]
+    means = torch.cat([*parts, torch.stack([2 * x + 1.0, torch.full_like(x, 3.0), z], dim=1)])
+    colours = torch.eye(3)[[0, 2, 1]].repeat_interleave(len(x), dim=0)
+    columns = {"means": means, "log_scales": torch.full_like(means, -2.8), "sh": (colours - 0.5)[:, None] / 0.2821}
+    columns["log_scales"][2 * len(x) :] = -1.8
+    return replace(make_scene(len(means), degree=0), **columns, logit_opacities=torch.full((len(means),), 3.0))
+
+
+@pytest.mark.parametrize("motion", [None, (VIEW, make_camera((0.4, -4.0, 0.0)))], ids=["still", "moved"])
+def test_a_spread_splat_has_the_light_that_is_seen_of_it(motion, monkeypatch):
+    renderer, opening = aaplug.Renderer.of(walls(), [VIEW], "matched", min_seen=0.0), Aperture(0.3, 7.0)
+    many = renderer(exposed(opening, motion, 256)).rgb
+    ours = [psnr(renderer(exposed(opening, motion, count)).rgb, many) for count in (1, 5)]
+    monkeypatch.setattr(aaplug.Renderer, "_light", lambda self, camera, samples: None)
+    alone = [psnr(renderer(exposed(opening, motion, count)).rgb, many) for count in (1, 5)]
+    assert ours[0] > alone[0] + 3
+    assert ours[1] > alone[1] + 1
+
+
+def test_a_view_that_shows_nothing_has_an_exposure_too():
+    sky, back = (0.2, 0.4, 0.6), torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    renderer = aaplug.Renderer.of(make_scene(20), [VIEW], "matched", min_seen=0.0, background=sky)
+    camera = replace(exposed(APERTURE), cam_from_world=back @ VIEW.cam_from_world)
+    assert torch.allclose(renderer(camera).rgb, torch.tensor(sky).expand(*camera.hw, 3))
+
+
+@dataclass(frozen=True)
+class WithoutGradients:
+    """The eager rasterizer, with no gradients."""
+
+    name: str = "without-gradients"
+
+    def __call__(self, *args, **keywords):
+        return Render(*(x.detach() for x in EAGER_TILED(*args, **keywords)))
+
+
+def test_an_exposure_needs_no_gradients():
+    with torch.inference_mode():
+        renderer = aaplug.Renderer.of(make_scene(20), [VIEW], "matched", min_seen=0.0, rasterizer="eager")
+        drawn = renderer(exposed(APERTURE)).rgb
+    again = aaplug.Renderer.of(make_scene(20), [VIEW], "matched", min_seen=0.0, rasterizer="eager")
+    assert torch.equal(drawn, again(exposed(APERTURE)).rgb)
+    without = replace(again, rasterizer=WithoutGradients())(exposed(APERTURE)).rgb
+    assert psnr(without, drawn) > 40
 
 
 @pytest.mark.parametrize("samples", [1, 16])

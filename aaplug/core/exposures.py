@@ -6,6 +6,7 @@ sample's camera stands at its place in the opening, its principal point moved so
 
 What follows is aaplug's own.  Each sample stands for a cell of the set, and so its splats are convolved with their path
 across that cell: samples that are few overlap instead of showing as ghosts.  A single sample takes the whole path.
+`rendering.light` says how much light a splat has then.
 """
 
 import math
@@ -22,9 +23,8 @@ from aaplug.core.cameras import Aperture, Camera
 from aaplug.core.rules import NEAR
 from aaplug.core.splats import Splats2D
 
-# Of a cell's variance, what its splats are convolved with: at most, and times a splat's width over its whole path's;
-# measured.  Opaque splats hide each other, and a wider filter adds the energies of those that are hidden too.
-MAX_CELL_SHARE, SHARE_PER_WIDTH = 0.5, 2.0
+CELL_SHARE = 0.75  # of a cell's variance, that its splats are convolved with; measured
+FAINT = 1 / 32  # opacity: of splats that are fainter once they are spread, some are drawn, with as much
 DIMENSIONS = 5  # x and y in the pixel and in the lens, and time
 SHORTEST = 1e-12  # px²: least variance of a path, at which roots have gradients
 MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
@@ -45,24 +45,40 @@ def sample_cameras(camera: Camera) -> Iterator[Camera]:
         yield replace(camera, fx=moved.fx, fy=moved.fy, cx=cx, cy=cy, cam_from_world=pose)
 
 
+def spread_out(
+    splats: Splats2D, camera: Camera, light: Float[Tensor, " m"] | None = None
+) -> tuple[Splats2D, Float[Tensor, " m"]]:
+    """Splats convolved with their path across a sample's cell, and their opacities before `FAINT` ones are left out.
+
+    light: what the opacity of a splat is multiplied by that is spread without end; None for 1.  That of one that keeps
+        the share r of its height is multiplied by light^(1 - r).
+    """
+    wide = splats.convolved(CELL_SHARE * cells(splats, camera), compensate=True, floor=0.0)
+    if light is not None:
+        left = (splats.dets / wide.dets).clamp(max=1.0).sqrt()
+        wide = wide.with_columns({"opacities": wide.opacities * light ** (1 - left)})
+    opacities, tiny = wide.opacities, torch.finfo(wide.opacities.dtype).tiny
+    chances = (opacities / splats.opacities.clamp(tiny, FAINT)).detach().clamp(tiny, 1.0)
+    turns = chances.double().cumsum(0)  # each whole turn draws one, so that neighbours in the file share the chances
+    chosen = ((turns + 0.5).floor() > (turns - chances + 0.5).floor()).nonzero().squeeze(1)
+    wide = wide.with_columns({"opacities": opacities / chances})
+    return wide.selected(chosen), opacities
+
+
 def cells(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
-    """Packed covariance in px² that one sample adds to each splat: of its path across the sample's cell.
+    """Packed covariance in px² of each splat's path across the cell of one sample.
 
     N samples that fill an ellipse of covariance Σ evenly have cells of covariance √det Σ / N; along a line, of λ / N².
-    Splats whose path is longer than four of their widths take less of it.
     """
     assert camera.exposure is not None
     xx, xy, yy = spread(splats, camera).unbind(dim=1)
     middle, half, count = ((xx + yy) / 2).clamp(min=SHORTEST), (xx - yy) / 2, camera.exposure.samples
-    tiny = torch.finfo(xx.dtype).tiny
-    radius = torch.hypot(half, xy + tiny)
+    radius = torch.hypot(half, xy + torch.finfo(xx.dtype).tiny)
     longer, shorter = middle + radius, (middle - radius).clamp(min=SHORTEST)
     even = (longer * shorter).sqrt() / count
     along, across = torch.maximum(even, longer / count**2), torch.minimum(even, shorter)
     mean, turn = (along + across) / 2, (along - across) / 2 / radius
-    ratio = (splats.covs[:, 0] + splats.covs[:, 2]) / (2 * middle)
-    share = (SHARE_PER_WIDTH * ratio.clamp(min=tiny).sqrt()).clamp(max=MAX_CELL_SHARE)
-    return share[:, None] * torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
+    return torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
 
 
 def spread(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:

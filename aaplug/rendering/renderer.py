@@ -22,7 +22,7 @@ from aaplug.core.cameras import Camera, CameraSet, Factor
 from aaplug.core.colours import BLACK, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.ellipses import cull
-from aaplug.core.exposures import cells, sample_cameras
+from aaplug.core.exposures import sample_cameras, spread_out
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns, SortsTiles
@@ -48,6 +48,7 @@ from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import CHANNELS, channels_at_once, find_rasterizer, kernels_of
+from aaplug.rendering.light import lights
 from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.cores import on_free_cores
@@ -56,6 +57,7 @@ from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 KEPT_RATES = 1 << 12  # free cameras whose rates a renderer remembers
+LIGHT_SCALE = 1 / 4  # of the view in which the light of an exposure's splats is looked up
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -225,7 +227,8 @@ class Renderer:
             count, samples = self.frames(camera)
             weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
             fine = self._fine(camera, samples)
-            frames = (self.paint(self.splats(each, samples), fine.hw) for each in sample_cameras(fine))
+            light = self._light(fine, samples)
+            frames = (self.paint(self.splats(each, samples, light), fine.hw) for each in sample_cameras(fine))
             pixels = (average_samples(frame, samples, weight) for frame in frames)
             rgb, alpha = reduce(lambda total, frame: Render(*map(torch.add, total, frame)), pixels)
             return Render(rgb / count, alpha / count)
@@ -414,12 +417,13 @@ class Renderer:
 
     @contract
     @on_free_cores()
-    def splats(self, camera: Camera, samples: int = 1) -> Splats2D:
+    def splats(self, camera: Camera, samples: int = 1, light: Float[Tensor, " n"] | None = None) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
 
         Without gradients, Gaussians pass in chunks, and memory is bounded by a chunk and by the splats that stay.
 
         samples: along a pixel's side, if `camera` is that of the supersampled image.
+        light: of the Gaussians, where its exposure spreads them, see `lights`; None: what each has alone.
         """
         cut = None if self.cutter is None else self.cutter(camera, self.coarsening(camera, samples))
         whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []
@@ -431,7 +435,7 @@ class Renderer:
             else:
                 chunk, places = self.scene if whole <= at_once else self.scene[start : start + at_once], start
                 shares = None
-            splats = self._projected(chunk, places, shares, camera)
+            splats = self._projected(chunk, places, shares, camera, light)
             if self.harmonics is None or not len(splats):
                 parts.append(shade(splats, self.scene, camera, self.kernels))
                 continue
@@ -448,8 +452,32 @@ class Renderer:
             raise UsageError(f"Gaussian {first}", f"has no finite colour (the first of {count})")
         return with_copies(splats, self.training.convention.rules)
 
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _light(self, fine: Camera, samples: int) -> Float[Tensor, " n"] | None:
+        """What the opacity of each Gaussian is multiplied by where the exposure of a view spreads it; see `lights`.
+
+        It is looked up in a small view of the exposure's middle; Gaussians beside it have the mean.  A compositor has a
+        rule of its own for what a splat hides, and does without.
+        """
+        if self.recipe.compositor is not None or fine.exposure is None:
+            return None
+        [middle] = sample_cameras(replace(fine, exposure=replace(fine.exposure, samples=1)))
+        small = replace(middle, exposure=fine.exposure)
+        if self.cutter is None:  # else a small view would show coarser levels of detail
+            small, samples = small.scaled(LIGHT_SCALE / samples), 1
+        splats, paint = self.splats(replace(small, exposure=None), samples), partial(self.paint, hw=small.hw)
+        found = lights(splats, small, self.training.convention.rules.min_alpha, partial(paint, background=BLACK))
+        beside = float(found.mean().nan_to_num(1.0))
+        return found.new_full((len(self.scene),), beside).index_copy_(0, splats.sources, found)
+
     def _projected(
-        self, chunk: Gaussians, places: Int[Tensor, " m"] | int, shares: Float[Tensor, " m"] | None, camera: Camera
+        self,
+        chunk: Gaussians,
+        places: Int[Tensor, " m"] | int,
+        shares: Float[Tensor, " m"] | None,
+        camera: Camera,
+        light: Float[Tensor, " n"] | None,
     ) -> Splats2D:
         """Splats of some Gaussians, without colour.
 
@@ -471,10 +499,10 @@ class Renderer:
         elif places:
             splats = replace(splats, sources=own + places)
         splats = filtered("screen filter", screen, splats, camera, training)
-        if camera.exposure is not None:
-            splats = splats.convolved(cells(splats, camera), compensate=True, floor=0.0)
         if shares is not None:
             splats = faded(splats, shares.index_select(0, own))
+        if camera.exposure is not None:
+            splats, _ = spread_out(splats, camera, None if light is None else light.index_select(0, splats.sources))
         ellipses = asked("pixel kernel", recipe.pixel, "bounding_ellipses", splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
 

@@ -9,12 +9,12 @@ from unittest.mock import patch
 
 import torch
 
+from aaplug.core import exposures
 from aaplug.core.camera_paths import orbit
 from aaplug.core.cameras import Aperture, Camera, Exposure
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import write_png
-from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.scenes import CHECKPOINTS, trained
@@ -59,7 +59,7 @@ def aperture(
                 truth = renderer(of(TRUTH)).rgb
                 images = {str(n): renderer(of(n)).rgb for n in (1, 5, 16)}
                 # samples stand for points, as plain supersampling's do
-                with patch.object(rendering, "cells", lambda splats, _: torch.zeros_like(splats.covs)):
+                with patch.object(exposures, "cells", lambda splats, _: torch.zeros_like(splats.covs)):
                     images["16 plain"] = renderer(of(16)).rgb
                 images["pinhole"] = renderer(view).rgb
                 works = {"one": partial(renderer, of(16)), "separate": partial(_separate, renderer, of(16))}
@@ -101,5 +101,5 @@ def _motion(renderer: Renderer, view: Camera, length: float) -> Callable[[int], 
 
 def _separate(renderer: Renderer, view: Camera) -> None:
     """Draw the frames of the samples one by one, as sharp views."""
-    for camera in rendering.sample_cameras(view):
+    for camera in exposures.sample_cameras(view):
         renderer(replace(camera, exposure=None))
