@@ -4,7 +4,6 @@ import json
 import math
 import struct
 from dataclasses import replace
-from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -20,8 +19,8 @@ from aaplug.io.images import read_image, write_png
 from aaplug.live import pictures
 from aaplug.live.messages import PickRequest, PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
+from aaplug.live.page import Page
 from aaplug.live.pictures import Pictures
-from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
 from aaplug.methods.recipe import LevelChoice
 from aaplug.rendering.renderer import Renderer
@@ -277,37 +276,21 @@ def test_the_depth_of_a_place_is_told(subject, background):
 
 def test_a_newer_request_ends_the_older_one_between_strips(subject, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 200)
-    studio = Studio(subject)
-    with studio.page(print) as page:
-        studio.receive(page, a_request(subject, id=1))
-        for _ in range(3):
-            page.step()
-        assert page.steps is not None
-        studio.receive(page, a_request(subject, id=2, scale=0.25))
-        messages = [message for _ in range(200) if (message := page.step() if page.busy else None)]
+    page = Page(subject)
+    page.receive(a_request(subject, id=1))
+    for _ in range(3):
+        page.step()
+    assert page.steps is not None
+    page.receive(a_request(subject, id=2, scale=0.25))
+    messages = [message for _ in range(200) if (message := page.step() if page.busy else None)]
     assert {unpacked(message)[0]["id"] for message in messages} == {2}
 
 
-def test_two_pages_take_turns_and_a_slow_one_waits(subject, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 200)
-    studio = Studio(subject)
-    with studio.page(print) as slow:
-        with studio.page(print) as other:
-            for page in (slow, other):
-                studio.receive(page, a_request(subject))
-            assert [studio._next() for _ in range(4)] == [slow, other] * 2
-            slow.sent = slow.received + 2
-            assert [studio._next() for _ in range(2)] == [other] * 2
-        slow.received += 1
-        assert studio._next() is slow
-
-
 def test_a_picture_that_fails_says_so_and_the_next_one_comes(subject, monkeypatch):
-    sent = SimpleQueue()
-    with Studio(subject) as studio, studio.page(sent.put) as page:
-        with monkeypatch.context() as broken:
-            broken.setattr(Pictures, "_preview", lambda *_: (_ for _ in ()).throw(MemoryError()))
-            studio.receive(page, a_request(subject))
-            assert unpacked(sent.get(timeout=10))[0] == {"problem": "out of memory"}
-        studio.receive(page, a_request(subject, id=2))
-        assert unpacked(sent.get(timeout=10))[0]["id"] == 2
+    page = Page(subject)
+    with monkeypatch.context() as broken:
+        broken.setattr(Pictures, "_preview", lambda *_: (_ for _ in ()).throw(MemoryError()))
+        page.receive(a_request(subject))
+        assert headers([page.step()]) == [{"problem": "out of memory"}]
+    page.receive(a_request(subject, id=2))
+    assert headers([page.step()])[0]["id"] == 2

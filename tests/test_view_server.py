@@ -5,17 +5,21 @@ import json
 import math
 import re
 import socket
-import time
 import webbrowser
 from contextlib import contextmanager
+from functools import partial
 from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 import torch
 
-from aaplug.live.messages import PictureRequest, Side, parse
+from aaplug.live.messages import PictureRequest, Receipt, Side, parse
+from aaplug.live.page import Page
+from aaplug.live.subject import Subject
+from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError, UsageError
+from aaplug.system.executors import given_threads, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.locks import LOCK_FILE_NAME, SCRATCH_PREFIX
 from aaplug.verbs.view import serving, view
@@ -159,27 +163,47 @@ def test_a_network_address_asks_for_its_token(seen):  # noqa: F811
             assert json.loads(connection.recv())["views"]
 
 
-def test_a_page_that_asks_without_reading_is_cut_off(seen, monkeypatch):  # noqa: F811
-    """Nothing of what it wants is kept for it without end, whatever it says that it has got."""
-    exceptions, queues = pytest.importorskip("websockets.exceptions"), []
+class FakePage(Page):
+    """A page whose socket says that it has got each picture, or takes one and no other."""
 
-    async def never_sends(connection, outbox):
-        queues.append(outbox)
-        await asyncio.Event().wait()
+    reads: bool = True
 
-    monkeypatch.setattr("aaplug.live.server._send_all", never_sends)
-    with serving(*seen, port=0) as address, connected(address) as bad:
-        bad.recv()
+    async def send(self, picture: bytes):
+        self.receive(Receipt(0)) if self.reads else await asyncio.Event().wait()
 
-        def ask_on():
-            for step in range(2000):
-                bad.send(json.dumps({"see": GOOD | {"id": step, "focal": 50 + step / 100, "moving": True}}))
-                bad.send('{"shown": 1}')
-                time.sleep(0.01)
 
-        with pytest.raises(exceptions.ConnectionClosed):
-            ask_on()
-    assert queues[0].qsize() <= 16
+def test_pages_are_drawn_in_turn_and_none_waits_for_one_that_does_not_read(seen, monkeypatch):  # noqa: F811
+    """Nothing of what that one wants is kept for it, whatever it says that it has got; all given cores draw."""
+    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 100)
+    scene, cameras = seen
+    subject = Subject(cameras, Renderer.of(scene, cameras, "matched", rasterizer="eager"), RECIPES, "a scene", ())
+    server_module = pytest.importorskip("aaplug.live.server")
+    with torch_threads(1, given=2):
+        server = server_module.Server(subject, lambda path: subject, "localhost", 0)
+    request, taken = parse(json.dumps({"see": GOOD}), RECIPES, 2), []
+
+    def step(page: Page):
+        taken.append((pages.index(page), given_threads()))
+        return Page.step(page)
+
+    async def draw():
+        tasks = [asyncio.create_task(server._draw(page, page.send)) for page in pages]
+        while any(page.busy for page in pages[:2]):
+            pages[2].received = pages[2].sent
+            await asyncio.sleep(0.01)
+        for task in tasks:
+            task.cancel()
+
+    pages = [FakePage(subject) for _ in range(3)]
+    pages[2].reads = False
+    for page in pages:
+        page.receive(request)
+        page.step = partial(step, page)
+    asyncio.run(draw())
+    assert [place for place, _ in taken[:3]] == [0, 1, 2]
+    assert [place for place, _ in taken[3:11]] == [0, 1] * 4
+    assert pages[2].sent == 1
+    assert {threads for _, threads in taken} == {2}
 
 
 NO_NAMES = ("../a.ply", "/etc/passwd", 100 * "é" + 100 * "e", "C:a\\b.ply", ".a.ply")

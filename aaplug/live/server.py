@@ -12,11 +12,10 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from errno import EADDRNOTAVAIL
-from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
 from os import sep, strerror
@@ -24,22 +23,23 @@ from pathlib import Path
 from shutil import disk_usage
 from urllib.parse import parse_qs
 
+import torch
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from aaplug.live import webpage
 from aaplug.live.messages import MAX_MESSAGE_BYTES, OpenRequest, parse
+from aaplug.live.page import Page
 from aaplug.live.pictures import message
-from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
-from aaplug.live.webpage import page
 from aaplug.system.errors import AaplugError, UsageError, reason
+from aaplug.system.executors import given_threads
 from aaplug.system.locks import scratch
 
 WEBSOCKET_PATH = "/live"
 MAX_OPEN_PAGES = 32
-MAX_WAITING_MESSAGES = 16  # to a page; one that reads leaves no more than two
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 log = logging.getLogger("aaplug.live")
 log.addHandler(logging.NullHandler())
@@ -47,13 +47,16 @@ log.propagate = False  # websockets would print a traceback for each bad request
 
 
 class Server:
-    """Serves a studio's pages; a context, in which it listens.
+    """Serves pages that show a subject; a context, in which it listens.
+
+    One thread draws for all pages in turn, a step for each that wants one.
 
     open_scene: makes a subject of a scene file.  port 0: any free one; raises UsageError if nothing can listen there.
     """
 
-    def __init__(self, studio: Studio, open_scene: Callable[[Path], Subject], host: str, port: int):
-        self._studio, self._open_scene, self._host, self._port = studio, open_scene, host, port
+    def __init__(self, subject: Subject, open_scene: Callable[[Path], Subject], host: str, port: int):
+        self._subject, self._open_scene, self._host, self._port = subject, open_scene, host, port
+        self._drawing = ThreadPoolExecutor(1, "drawing", torch.set_num_threads, (given_threads(),))
         self._token = None if _is_local(host) else secrets.token_urlsafe(16)
         self._open_pages = 0
         self._started: Future[tuple[asyncio.AbstractEventLoop, int]] = Future()  # with its loop and port
@@ -69,7 +72,7 @@ class Server:
         return f"http://{host}:{self._port}/{token}"
 
     def __enter__(self) -> "Server":
-        self._about = json.dumps(self._studio.subject.about(), allow_nan=False)
+        self._first = _shown(self._subject)
         self._thread.start()
         try:
             self._loop, self._port = self._started.result()
@@ -85,6 +88,7 @@ class Server:
     def __exit__(self, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join()
+        self._drawing.shutdown()
 
     async def _serve(self) -> None:
         limits = {"max_size": MAX_MESSAGE_BYTES, "max_queue": 16, "compression": None}
@@ -110,7 +114,7 @@ class Server:
         if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
             return _response(HTTPStatus.FORBIDDEN, "Open the address that the terminal shows: it ends in a token.")
         if path == "/":
-            return _response(HTTPStatus.OK, page(), "text/html")
+            return _response(HTTPStatus.OK, webpage.page(), "text/html")
         if path != WEBSOCKET_PATH:
             return _response(HTTPStatus.NOT_FOUND, "There is one page here: /")
         if len(origins) != 1 or origins[0].casefold() not in (f"http://{host}", f"https://{host}"):
@@ -121,51 +125,59 @@ class Server:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one page, from its first word to its last."""
-        subject, sending, file = self._studio.subject, None, None
-        outbox: asyncio.Queue[bytes] = asyncio.Queue(MAX_WAITING_MESSAGES)
+        shown: tuple[Subject, str] | None = self._first
         self._open_pages += 1
         try:
-            with (
-                scratch() as folder,
-                self._studio.page(partial(self._post, connection, outbox)) as client,
-                suppress(ConnectionClosed),
-            ):
-                await connection.send(self._about)
-                sending = asyncio.create_task(_send_all(connection, outbox))
-                async for said in connection:
+            with scratch() as folder, suppress(ConnectionClosed):
+                while shown is not None:
+                    subject, about = shown
+                    await connection.send(about)
+                    page = Page(subject)
+                    drawing = asyncio.create_task(self._draw(page, connection.send))
                     try:
-                        if isinstance(said, bytes) and file is not None:
-                            if file.add(said):
-                                subject, file = await asyncio.to_thread(self._open_scene, file.path), None
-                                self._studio.show(client, subject)
-                                about = await asyncio.to_thread(subject.about)  # it draws
-                                await connection.send(json.dumps(about, allow_nan=False))
-                            continue
-                        request = parse(said, subject.recipes, len(subject.views))
-                        if isinstance(request, OpenRequest):
-                            file = IncomingFile(folder, request, allowed=self._token is None)
-                            await connection.send(message({"take": request.name}, []))
-                        else:
-                            self._studio.receive(client, request)
-                    except (AaplugError, MemoryError, OSError) as error:
-                        file, why = None, str(error).replace(f"{folder}{sep}", "") or "out of memory"
-                        await connection.send(message({"refused": why}, []))
+                        shown = await self._listen(connection, page, folder)
+                    finally:
+                        drawing.cancel()
         finally:
             self._open_pages -= 1
-            if sending is not None:
-                sending.cancel()
 
-    def _post(self, connection: ServerConnection, outbox: "asyncio.Queue[bytes]", picture: bytes) -> None:
-        """Put a picture into a page's outbox, from the studio's thread; a page that reads none is cut off."""
+    async def _draw(self, page: Page, send: Callable[[bytes], Awaitable[None]]) -> None:
+        """Send what a page wants; its next step waits until the last is sent, and behind those of other pages."""
+        with suppress(ConnectionClosed):  # a closed tab
+            while True:
+                page.changed.clear()
+                while page.busy:
+                    picture = await asyncio.get_running_loop().run_in_executor(self._drawing, page.step)
+                    if picture is not None:
+                        page.sent += 1
+                        await send(picture)
+                await page.changed.wait()
 
-        def put() -> None:
-            if outbox.full():
-                connection.transport.abort()
-            else:
-                outbox.put_nowait(picture)
+    async def _listen(self, connection: ServerConnection, page: Page, folder: Path) -> tuple[Subject, str] | None:
+        """Hear a page, until it has sent the file of another scene, which is returned as by `_shown`, or is closed."""
+        file = None
+        async for said in connection:
+            try:
+                if isinstance(said, bytes) and file is not None:
+                    if file.add(said):
+                        subject = await asyncio.to_thread(self._open_scene, file.path)
+                        return await asyncio.to_thread(_shown, subject)
+                    continue
+                request = parse(said, page.subject.recipes, len(page.subject.views))
+                if isinstance(request, OpenRequest):
+                    file = IncomingFile(folder, request, allowed=self._token is None)
+                    await connection.send(message({"take": request.name}, []))
+                else:
+                    page.receive(request)
+            except (AaplugError, MemoryError, OSError) as error:
+                file, why = None, str(error).replace(f"{folder}{sep}", "") or "out of memory"
+                await connection.send(message({"refused": why}, []))
+        return None
 
-        with suppress(RuntimeError):  # the server has closed meanwhile
-            self._loop.call_soon_threadsafe(put)
+
+def _shown(subject: Subject) -> tuple[Subject, str]:
+    """A subject, and what a page is told of it, which takes some drawing."""
+    return subject, json.dumps(subject.about(), allow_nan=False)
 
 
 class IncomingFile:
@@ -187,12 +199,6 @@ class IncomingFile:
             stream.write(part)
         self._missing -= len(part)
         return self._missing == 0
-
-
-async def _send_all(connection: ServerConnection, outbox: "asyncio.Queue[bytes]") -> None:
-    with suppress(ConnectionClosed):  # a closed tab
-        while True:
-            await connection.send(await outbox.get())
 
 
 def _is_local(host: str) -> bool:

@@ -28,7 +28,6 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
     """
     check_installed("websockets", "view", "view", "needs the extra `view`")
     from aaplug.live.server import Server  # its package is an extra
-    from aaplug.live.studio import Studio
     from aaplug.live.subject import Subject
 
     def subject_of(scene: SceneLike, cameras: CamerasLike, title: str | None, words: Sequence[str]) -> Subject:
@@ -50,8 +49,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
             subject = subject_of(scene, cameras, "the bundled sample", options.words)
         else:
             subject = subject_of(scene, cameras, None, options.words)
-        studio = stack.enter_context(Studio(subject))
-        yield stack.enter_context(Server(studio, dropped, options.host, options.port)).address
+        yield stack.enter_context(Server(subject, dropped, options.host, options.port)).address
 
 
 @looks(LiveOptions)
