@@ -29,9 +29,8 @@ from aaplug.core.splats import Render
 from aaplug.gsplat import patch, rasterization, rasterization_2dgs
 from aaplug.gsplat.arguments import FIXED
 from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
 from aaplug.gsplat.discs import normals_of_depth
-from aaplug.gsplat.harmonics import spherical_harmonics
+from aaplug.gsplat.on_cuda_alone import compute_relocation, quat_scale_to_covar_preci, spherical_harmonics
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from aaplug.gsplat.densification import adam, compute_relocation, quat_scale_to_covar_preci
-from aaplug.gsplat.harmonics import spherical_harmonics
+from aaplug.gsplat.on_cuda_alone import adam, compute_relocation, quat_scale_to_covar_preci, spherical_harmonics
 from aaplug.gsplat.rendering import rasterization, rasterization_2dgs
 from aaplug.system.errors import UsageError
 

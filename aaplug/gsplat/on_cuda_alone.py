@@ -1,10 +1,11 @@
-"""Steps of training that gsplat computes on CUDA alone: relocation, covariances for its noise, and selective Adam.
+"""Functions that gsplat computes on CUDA alone: relocation, covariances for its noise, selective Adam, and harmonics.
 
 n: Gaussians; b: leading dimensions.  3DGS-MCMC is Kheradmand et al. 2024, arXiv 2404.09591; Taming 3DGS is Mallick et
 al. 2024, arXiv 2406.15643.
 """
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,7 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.projection import rotation_matrices
-from aaplug.system.contracts import contract
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, sh_colour
+from aaplug.system.contracts import Range, contract
+from aaplug.system.errors import UsageError
 
 MAX_OPACITY = 1 - torch.finfo(torch.float32).eps  # nearer to 1 the sum of `compute_relocation` loses digits
 
@@ -80,3 +83,25 @@ def adam(
     for average, rate, value in ((exp_avg, b1, param_grad), (exp_avg_sq, b2, param_grad.square())):
         average[valid] = average[valid].lerp(value[valid], 1 - rate)
     param[valid] -= lr * exp_avg[valid] / (exp_avg_sq[valid].sqrt() + eps)
+
+
+@contract
+def spherical_harmonics(
+    degrees_to_use: Annotated[int, Range(0, 4)],
+    dirs: Float[Tensor, "*b 3"],
+    coeffs: Float[Tensor, "*b k 3"],
+    masks: Bool[Tensor, "*b"] | None = None,
+) -> Float[Tensor, "*b 3"]:
+    """Sums of real spherical harmonics, [*b, 3], without 3DGS's offset of 0.5.
+
+    k: coefficients per channel, of which the first (degree + 1)² are read.  dirs: of any length but zero.
+    masks: where False, the sum is 0.
+
+    Raises UsageError if shapes do not fit each other, or there are too few coefficients.
+    """
+    count, given = (degrees_to_use + 1) ** 2, coeffs.shape[-2]
+    if count > given:
+        raise UsageError("degrees_to_use", f"{degrees_to_use} needs {count} coefficients, coeffs has {given}")
+    directions = functional.normalize(dirs.reshape(-1, 3), dim=1)
+    sums = (sh_colour(coeffs[..., :count, :].reshape(-1, count, 3), directions) - COLOUR_OFFSET).view_as(dirs)
+    return sums if masks is None else sums.where(masks[..., None], 0.0)
