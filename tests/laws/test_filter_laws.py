@@ -31,9 +31,10 @@ TWICE = TrainingViews.of(ONE, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 
     ("name", "variance", "compensated"), [("classic", 0.3, False), ("ewa", 0.3, True), ("mip", 0.1, True)]
 )
 def test_a_dilation_has_its_published_constant_at_every_rate(name, variance, compensated, situation):
-    splats = project(SCENE, situation.view)
+    view, training = situation
+    splats = project(SCENE, view)
     expected = splats.blurred(variance, compensated)
-    filtered = SCREEN_FILTERS[name](splats, situation.view, situation.training)
+    filtered = SCREEN_FILTERS[name](splats, view, training)
     torch.testing.assert_close(filtered.covs, expected.covs)
     torch.testing.assert_close(filtered.opacities, expected.opacities)
 

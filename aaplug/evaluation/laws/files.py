@@ -22,8 +22,9 @@ COUNT = 20  # Gaussians
 HEADS = (b"", b"\0" * 64, b"\xff" * 64, b"ply\n" + b"comment " * 8, b"PK\3\4" + bytes(60), b"{" * 64)
 
 
-def _noise(seed: int) -> Tensor:
-    return torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(seed))
+def _images() -> list[Tensor]:
+    """Two images of noise."""
+    return [*torch.rand(2, 64, 64, 3, generator=torch.Generator().manual_seed(0))]
 
 
 @law_of("metric")
@@ -31,23 +32,19 @@ def is_ideal_for_the_truth(metric: Metric) -> None:
     """`measure` gives `ideal` or None for the truth, a worse value for noise, the same again, and keeps both images."""
     if metric.measure is None:
         return
-    truth, noise = quantised(_noise(0)), quantised(_noise(1))
+    truth, noise = map(quantised, _images())
     try:
         metric.measure(truth, truth)
     except UsageError:  # it needs files that are not here
         return
     ideal, value, again = (metric.compare(image, truth) for image in (truth, noise, noise))
     require(value == again, f"gives {value}, then {again}")
-    kept = truth.equal(quantised(_noise(0))) and noise.equal(quantised(_noise(1)))
+    kept = all(a.equal(quantised(b)) for a, b in zip((truth, noise), _images(), strict=True))
     require(kept, "changes an image")
     close = ideal is None or math.isclose(ideal, metric.ideal, abs_tol=1e-4)
     require(close, f"the truth has {ideal} instead of {metric.ideal}")
     worse = value is None or ideal is None or metric.loss(value) > metric.loss(ideal)
     require(worse, f"noise has {value}, which is no worse than {ideal}")
-
-
-def _images() -> list[Tensor]:
-    return [*torch.rand(2, 64, 64, 3, generator=torch.Generator().manual_seed(0))]
 
 
 @law_of("loss")
@@ -68,15 +65,11 @@ def has_gradients_of_images(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     away = 0.01 * (image - truth)
     with torch.no_grad():
         rise = float(loss(image + away, truth) - loss(image - away, truth)) / 2
-    told, same = (_gradient(loss, each, truth) for each in (image, truth))
+    leaves = [each.clone().requires_grad_() for each in (image, truth)]
+    told, same = (torch.autograd.grad(loss(leaf, truth), leaf)[0] for leaf in leaves)
     along = float((told * away).sum())
     require(math.isclose(rise, along, rel_tol=0.05), f"rises by {rise:g} where its gradient says {along:g}")
     require(same.isfinite().all(), "the gradient is NaN or infinite for the truth itself")
-
-
-def _gradient(loss: Callable[[Tensor, Tensor], Tensor], image: Tensor, truth: Tensor) -> Tensor:
-    leaf = image.clone().requires_grad_()
-    return torch.autograd.grad(loss(leaf, truth), leaf)[0]
 
 
 @law_of("scene format")

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ScreenFilter, WorldFilter
@@ -48,18 +47,11 @@ def trained_with(convention: Convention) -> TrainingViews:
     return TrainingViews.of(replace(SCENE, convention=convention), CAMERAS)
 
 
-class Situation(NamedTuple):
-    """A view, and the training views of `SCENE` in a convention."""
-
-    view: Camera
-    training: TrainingViews
-
-
-SITUATIONS = {
-    "training size, classic": Situation(CAMERAS[0], trained_with(CLASSIC)),
-    "half, antialiased": Situation(CAMERAS[0].scaled(0.5), trained_with(ANTIALIASED)),
-    "threefold, mip": Situation(CAMERAS[0].scaled(3.0), trained_with(MIP)),
-    "free, near and small, classic": Situation(FREE.scaled(0.3), trained_with(CLASSIC)),
+SITUATIONS = {  # a view, and training views
+    "training size, classic": (CAMERAS[0], trained_with(CLASSIC)),
+    "half, antialiased": (CAMERAS[0].scaled(0.5), trained_with(ANTIALIASED)),
+    "threefold, mip": (CAMERAS[0].scaled(3.0), trained_with(MIP)),
+    "free, near and small, classic": (FREE.scaled(0.3), trained_with(CLASSIC)),
 }
 
 
