@@ -20,7 +20,7 @@ from pathlib import Path
 import jaxtyping
 import torch
 
-from aaplug.evaluation.survey import survey
+from aaplug.evaluation.coverage import survey
 from aaplug.io.scenes import read_scene
 from aaplug.system.errors import AaplugError
 from tests.scene_files import DATA, MADE, SEVERAL, STORED, write_file

@@ -9,7 +9,7 @@ import torch
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.survey import Histogram, check_frame_of, survey
+from aaplug.evaluation.coverage import Histogram, check_frame_of, survey
 from aaplug.io.scenes import read_scene, write_parts, write_scene
 from aaplug.methods.conversion import FORMS, fuse
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE

@@ -7,9 +7,11 @@ relative rate r its variance is r²(σ²ν² + dilation) px², which meets the b
 that scale it aliases.
 
 The share of the splats' energy above the Nyquist rate (`core.spectra`) takes all axes, opacities and the recipe in too.
+A survey gathers the same of a file, with other statistics, part by part in bounded memory.
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -19,16 +21,21 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
-from aaplug.core.sampling import SamplingBounds
+from aaplug.core.sampling import SamplingBounds, check_frame, sampling_bounds
 from aaplug.core.spectra import energies
 from aaplug.core.training import TrainingViews
+from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.monitor import Tell
 
 BINS = 48
 SPECTRUM_VIEWS = 3  # from which the energy above the Nyquist rate is taken
 LOWEST_LOG2, HIGHEST_LOG2 = -7.0, 5.0  # of extent over bound; the end bins of the histogram count what lies outside
+PROBE_ROWS = 64  # Gaussians read at each place of the file
+SURVEY_BINS = 4096  # of a histogram
+NEEDLE_RATIO = 10.0  # longest axis over the middle one, from which a Gaussian is a needle
 
 
 @dataclass(frozen=True)
@@ -96,3 +103,85 @@ def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float])
     under = int((multiples < 0).sum()) / len(multiples)
     begins = aliasing_begins(float(extents.median()), dilation)
     return Coverage(*counts, under, begins, tuple((s, float((dilated * s < 1).double().mean())) for s in scales))
+
+
+class Histogram:
+    """Counts of values between two ends; the first and the last bin also count what lies outside."""
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = low, high
+        self.counts = torch.zeros(SURVEY_BINS, dtype=torch.int64)
+
+    def add(self, values: Float[Tensor, " n"]) -> None:
+        """Count values."""
+        self.counts += torch.histc(values.double().clamp(self.low, self.high), SURVEY_BINS, self.low, self.high).long()
+
+    def quantile(self, share: float) -> float | None:
+        """Middle of the bin that holds this quantile; None without values."""
+        if not (total := int(self.counts.sum())):
+            return None
+        place = int(torch.searchsorted(self.counts.cumsum(0), max(1, math.ceil(share * total))))
+        return self.low + (place + 0.5) * (self.high - self.low) / SURVEY_BINS
+
+    def share_below(self, value: float) -> float | None:
+        """Share of the values in bins below that of a value; None without values."""
+        place = min(SURVEY_BINS, max(0, round((value - self.low) / (self.high - self.low) * SURVEY_BINS)))
+        return int(self.counts[:place].sum()) / total if (total := int(self.counts.sum())) else None
+
+
+@dataclass(eq=False)
+class Survey:
+    """Counts over a scene.  Rates and multiples are natural logarithms.
+
+    seen, under: Gaussians that a camera sees, and those of them below their sampling bound.
+    needles: Gaussians more than `NEEDLE_RATIO` times as long as broad.
+    above_zero: Gaussians with three log-scales above 0.  activated: with an opacity logit in [0, 1].
+    rates: highest sampling rate in training.  multiples: extent over the sampling bound.
+    largest: log-scale.  filtered: true if a 3D filter is stored.  faults: unusable rows by their fault.
+    """
+
+    count: int = 0
+    seen: int = 0
+    under: int = 0
+    needles: int = 0
+    above_zero: int = 0
+    activated: int = 0
+    low: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), torch.inf))
+    high: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), -torch.inf))
+    rates: Histogram = field(default_factory=lambda: Histogram(-35.0, 35.0))
+    multiples: Histogram = field(default_factory=lambda: Histogram(-20.0, 20.0))
+    largest: float = -math.inf
+    filtered: bool = False
+    faults: Counter[str] = field(default_factory=Counter)
+
+
+def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
+    """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
+    found = Survey()
+    tell(0, opened.count)  # parts differ in size, so the rate counts from here
+    for part in opened.parts(faults=found.faults):
+        found.filtered |= part.filter_3d is not None
+        if not len(part):
+            continue
+        found.count += len(part)
+        low, high = part.means.aminmax(dim=0)
+        found.low, found.high = torch.minimum(found.low, low), torch.maximum(found.high, high)
+        found.largest = max(found.largest, part.log_scales.max().item())
+        _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
+        found.needles += int((long - broad > math.log(NEEDLE_RATIO)).sum())
+        found.above_zero += int((part.log_scales > 0).all(dim=1).sum())
+        found.activated += int(((part.logit_opacities >= 0) & (part.logit_opacities <= 1)).sum())
+        if cameras:
+            bounds = sampling_bounds(part.means, cameras)
+            found.seen += int(bounds.seen.sum())
+            found.rates.add(bounds.highest[bounds.seen].log())
+            multiples = log_multiples(part, bounds)
+            found.multiples.add(multiples)
+            found.under += int((multiples < 0).sum())
+        tell(found.count, opened.count)
+    return found
+
+
+def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:
+    """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
+    return check_frame(opened.sample(PROBE_ROWS).means, cameras, opened.name, min_seen)

@@ -12,8 +12,8 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds, sampling_bounds
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.coverage import check_frame_of
 from aaplug.evaluation.results import Report, results
-from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format

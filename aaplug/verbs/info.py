@@ -6,9 +6,8 @@ from typing import Any
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.coverage import above_nyquist, aliasing_begins
+from aaplug.evaluation.coverage import Survey, above_nyquist, aliasing_begins, check_frame_of, survey
 from aaplug.evaluation.results import scale_name
-from aaplug.evaluation.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene import Scene
