@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from aaplug.live.messages import PictureRequest, Receipt, Side, parse
+from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.live.page import Page
 from aaplug.live.subject import Subject
 from aaplug.rendering.renderer import Renderer
@@ -169,7 +169,7 @@ class FakePage(Page):
     reads: bool = True
 
     async def send(self, picture: bytes):
-        self.receive(Receipt(0)) if self.reads else await asyncio.Event().wait()
+        self.receive(None) if self.reads else await asyncio.Event().wait()
 
 
 def test_pages_are_drawn_in_turn_and_none_waits_for_one_that_does_not_read(seen, monkeypatch):  # noqa: F811

@@ -91,18 +91,11 @@ class OpenRequest:
     size: int
 
 
-@dataclass(frozen=True)
-class Receipt:
-    """The page has the picture of this number."""
-
-    id: int
-
-
 Order = StillRequest | PickRequest  # beside the picture that is wanted last, all are served
 
 
-def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | Order | OpenRequest | Receipt:
-    """Read a message.
+def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | Order | OpenRequest | None:
+    """Read a message; None says that a picture has arrived.
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
 
@@ -115,7 +108,8 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
     [kind] = message
     whole = Entry(place, message)
     if kind == "shown":
-        return Receipt(whole.get("shown", NUMBERED))
+        whole.get("shown", NUMBERED)
+        return None
     body = whole.entry(kind)
     if kind == "open":
         name = body.get("name", printable_text)

@@ -5,7 +5,7 @@ import logging
 from collections import deque
 from dataclasses import dataclass, field
 
-from aaplug.live.messages import Order, PictureRequest, Receipt
+from aaplug.live.messages import Order, PictureRequest
 from aaplug.live.pictures import Pictures, Steps, message
 from aaplug.live.subject import Subject
 from aaplug.system.errors import AaplugError, UsageError, printable
@@ -36,12 +36,12 @@ class Page:
     def __post_init__(self) -> None:
         self.pictures = Pictures(self.subject)
 
-    def receive(self, said: PictureRequest | Order | Receipt) -> None:
-        """Take a message of the page; raises UsageError if it wants more than it may."""
+    def receive(self, said: PictureRequest | Order | None) -> None:
+        """Take a message of the page, as `parse` gives it; raises UsageError if it wants more than it may."""
         match said:
             case PictureRequest():
                 self.request, self.newer = said, True
-            case Receipt():
+            case None:
                 self.received = min(self.sent, self.received + 1)
             case _ if self.request is None or len(self.orders) >= MAX_WAITING_ORDERS:
                 raise UsageError("still", "wait until the ones before are done")
