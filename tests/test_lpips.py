@@ -24,8 +24,8 @@ def lpips_weights(folder: Path) -> dict[str, tuple[Path, Path]]:
     for name, net in NETS.items():
         g = torch.Generator().manual_seed(3)
         trunk, before, size = {}, 3, {"vgg": 3, "alex": 3}[name]
-        for stage, channels in zip(net, CHANNELS, strict=True):
-            for number, *_ in stage.convolutions:
+        for (_, convolutions), channels in zip(net, CHANNELS, strict=True):
+            for number, *_ in convolutions:
                 trunk[f"features.{number}.weight"] = torch.randn(channels, before, size, size, generator=g)
                 trunk[f"features.{number}.bias"] = torch.randn(channels, generator=g)
                 before = channels

@@ -23,22 +23,22 @@ EPSILON = 1e-10  # added to a feature's length before dividing by it (LPIPS)
 MIN_SIDE = 32  # px: smaller images leave nothing after five stages
 
 
-@dataclass(frozen=True)
-class Stage:
-    """A pooling, then convolutions: (number in torchvision's `features`, stride, padding) each."""
-
-    convolutions: tuple[tuple[int, int, int], ...]
-    pool: tuple[int, int] | None = None  # window and stride, in px
-
-
-NETS = {
-    "vgg": tuple(
-        Stage(tuple((number, 1, 1) for number in numbers), (2, 2) if stage else None)
-        for stage, numbers in enumerate(((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)))
+# A pooling's window and stride in px, then convolutions: number in torchvision's `features`, stride and padding of each
+Stage = tuple[tuple[int, int] | None, tuple[tuple[int, int, int], ...]]
+NETS: dict[str, tuple[Stage, ...]] = {
+    "vgg": (
+        (None, ((0, 1, 1), (2, 1, 1))),
+        ((2, 2), ((5, 1, 1), (7, 1, 1))),
+        ((2, 2), ((10, 1, 1), (12, 1, 1), (14, 1, 1))),
+        ((2, 2), ((17, 1, 1), (19, 1, 1), (21, 1, 1))),
+        ((2, 2), ((24, 1, 1), (26, 1, 1), (28, 1, 1))),
     ),
-    "alex": tuple(
-        Stage((convolution,), (3, 2) if stage in (1, 2) else None)
-        for stage, convolution in enumerate(((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)))
+    "alex": (
+        (None, ((0, 4, 2),)),
+        ((3, 2), ((3, 1, 2),)),
+        ((3, 2), ((6, 1, 1),)),
+        (None, ((8, 1, 1),)),
+        (None, ((10, 1, 1),)),
     ),
 }
 VARIANTS: dict[LpipsFlavour, str] = {
@@ -55,15 +55,15 @@ def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str |
     """
     net = NETS["alex" if flavour == "alex" else "vgg"]
     state, weights, channels = _state(Path(trunk)), dict[int, tuple[Tensor, Tensor]](), 3
-    for number in (number for stage in net for number, _, _ in stage.convolutions):
+    for number in (number for _, convolutions in net for number, _, _ in convolutions):
         weight, bias = (state.get(f"features.{number}.{part}") for part in ("weight", "bias"))
         if weight is None or bias is None or weight.dim() != 4 or weight.shape[1] != channels:
             problem = f"holds no features.{number} for {channels} channels; give torchvision's weights"
             raise FormatError(Path(trunk), problem)
         weights[number], channels = (weight.float(), bias.float()), weight.shape[0]
     state, linear = _state(Path(heads)), []
-    for number, stage in enumerate(net):
-        head, count = state.get(f"lin{number}.model.1.weight"), weights[stage.convolutions[-1][0]][0].shape[0]
+    for number, (_, convolutions) in enumerate(net):
+        head, count = state.get(f"lin{number}.model.1.weight"), weights[convolutions[-1][0]][0].shape[0]
         if head is None or head.shape != (1, count, 1, 1):
             problem = f"holds no lin{number} of {count} channels; give the lpips package's weights"
             raise FormatError(Path(heads), problem)
@@ -91,9 +91,9 @@ class _Distance:
         x = image.float() if self.from_unit else 2 * image.float() - 1
         x = ((x - x.new_tensor(SHIFT)) / x.new_tensor(SCALE)).permute(2, 0, 1)[None]
         maps = []
-        for stage in self.net:
-            x = max_pool2d(x, *stage.pool) if stage.pool else x
-            for number, stride, padding in stage.convolutions:
+        for pool, convolutions in self.net:
+            x = max_pool2d(x, *pool) if pool else x
+            for number, stride, padding in convolutions:
                 x = relu(conv2d(x, *self.weights[number], stride=stride, padding=padding))
             maps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
         return maps
