@@ -86,7 +86,7 @@ class Cloud:
     points: Float[Tensor, "p 3"]
 
     @classmethod
-    def of(cls, scene: Gaussians, most: int) -> "Cloud":
+    def of(cls, scene: Gaussians, most: int = MAX_PLACES) -> "Cloud":
         """At most so many of the scene's places, evenly spaced in its order."""
         return cls(scene.means[:: max(1, -(-len(scene) // most))].detach().double())
 
@@ -133,13 +133,13 @@ def mismatch(reference: Gaussians, other: Gaussians) -> str | None:
     """
     if not len(reference) or not len(other):
         return None
-    places, queries = Cloud.of(reference, MAX_PLACES), Cloud.of(other, MAX_QUERIES)
-    if len(reference) == len(other) and (pairs := _from_pairs(reference, other)) is not None:
+    places, others, queries = Cloud.of(reference), Cloud.of(other), Cloud.of(other, MAX_QUERIES)
+    if len(reference) == len(other) and (pairs := _from_pairs(places, others)) is not None:
         return pairs.described(places) or None
     apart = places.apart(queries.points)
     if apart <= CERTAIN_DISTANCE * places.spacing:
         return None
-    candidates = list(_candidates(places, Cloud.of(other, MAX_PLACES)))
+    candidates = list(_candidates(places, others))
     most = min(BELIEVED_SHARE * apart, SURFACE_DISTANCE * places.spacing)
     distances = [places.apart(t.undone(queries.points), most) for t in candidates]
     if (least := min(distances)) < math.inf:
@@ -164,12 +164,11 @@ def _candidates(reference: Cloud, other: Cloud) -> Iterator[Similarity]:
         yield Similarity(turn, scale, other.middle - scale * turn @ reference.middle)
 
 
-def _from_pairs(reference: Gaussians, other: Gaussians) -> Similarity | None:
-    """The transform that carries each of the reference's Gaussians to the one in the same row; None if none does.
+def _from_pairs(a: Cloud, b: Cloud) -> Similarity | None:
+    """The transform that carries each place of the first to the one in the same row; None if none does.
 
     Least squares over the core (Umeyama 1991, eqs. 39 to 43, mirroring included).
     """
-    a, b = Cloud.of(reference, MAX_PLACES), Cloud.of(other, MAX_PLACES)
     core = (a.points - a.middle).norm(dim=1) <= CORE_RADIUS * a.size
     x, y = a.points[core], b.points[core]
     x_mean, y_mean = x.mean(dim=0), y.mean(dim=0)

@@ -12,7 +12,7 @@ n: Gaussians, m: pairs.
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from statistics import median
 from typing import Any, NamedTuple
@@ -73,10 +73,6 @@ class Differences:
     sorted: bool
     changes: Mapping[str, Change]
 
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return {"paired": self.paired, "sorted": self.sorted} | {k: vars(v) for k, v in self.changes.items()}
-
 
 def differences(reference: Gaussians, other: Gaussians) -> Differences | None:
     """The changes from the reference to the other; None where their counts differ or there is no Gaussian."""
@@ -129,7 +125,10 @@ class ComparedScene:
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready."""
-        return vars(self) | {"differences": self.differences and self.differences.as_json()}
+        facts = asdict(self)
+        if found := facts["differences"]:
+            facts["differences"] = found | found.pop("changes")
+        return facts
 
 
 def in_one_frame(scenes: Mapping[str, Scene], say: Say = lambda text: None) -> dict[str, Scene]:

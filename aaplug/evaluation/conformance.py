@@ -7,8 +7,8 @@ fault that explains the picture is named.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -312,30 +312,21 @@ class Conformance:
         return not any(finding.wrong for finding in self.findings)
 
 
-@dataclass(frozen=True)
 class _Seen:
-    """A renderer's picture of a test."""
+    """A renderer's picture of a test.  white: True if its background is, in most corners."""
 
-    test: Test
-    picture: Picture
-    errors: dict[tuple[str, str], float] = field(default_factory=dict)
-
-    @cached_property
-    def white(self) -> bool:
-        """True if the background is white: in most corners."""
-        return float(self.picture[:: SIDE - 1, :: SIDE - 1].median()) > 0.5
+    def __init__(self, test: Test, picture: Picture):
+        self.test, self.picture, self.error = test, picture, cache(self._error)
+        self.white = float(picture[:: SIDE - 1, :: SIDE - 1].median()) > 0.5
 
     def expected(self, viewer: Viewer, fault: Fault = NONE) -> Picture:
         return draw(self.test.scene, viewer, fault, self.white)
 
-    def error(self, viewer: Viewer, fault: Fault = NONE) -> float:
+    def _error(self, viewer: Viewer, fault: Fault = NONE) -> float:
         """`Finding.error` against the picture with a fault."""
-        key = viewer.name, fault.words
-        if key not in self.errors:
-            squares = (self.expected(viewer, fault) - self.picture).square()
-            patches = squares.reshape(SIDE // PATCH, PATCH, -1, PATCH, 3).mean(dim=(1, 3))
-            self.errors[key] = LEVELS * float(patches.max().sqrt())
-        return self.errors[key]
+        squares = (self.expected(viewer, fault) - self.picture).square()
+        patches = squares.reshape(SIDE // PATCH, PATCH, -1, PATCH, 3).mean(dim=(1, 3))
+        return LEVELS * float(patches.max().sqrt())
 
     def agrees(self, viewer: Viewer, fault: Fault = NONE) -> bool:
         return self.error(viewer, fault) <= self.test.tolerance

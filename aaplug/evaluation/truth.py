@@ -114,7 +114,8 @@ class ViewTruth:
 
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
-        self.reference, self.motion = cache(self._reference), cache(self._motion)
+        self.reference = cache(lambda scale: truth.timed(self.camera(scale)))  # the reference at a scale
+        self.motion = cache(self._motion)
 
     def camera(self, scale: float) -> Camera:
         """The view at a scale."""
@@ -175,10 +176,6 @@ class ViewTruth:
     def resized_look(self, scale: float) -> Image:
         """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
-
-    def _reference(self, scale: float) -> TimedImage:
-        """The reference at a scale."""
-        return self.truth.timed(self.camera(scale))
 
     def _motion(self, scale: float) -> list[Image]:
         """Frames that move by 1/4 px of this scale: of the reference, or of training-size renders, then resampled."""
