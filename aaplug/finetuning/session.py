@@ -58,11 +58,11 @@ def tune(
         pace = (time.monotonic() - started) / max(1, state.step - first)
         monitor.say(f"step {state.step} of {steps}{loss}: {decibels}; {pace:.2f} s per step")
 
-    with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as interrupted:
+    with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as presses:
 
         def stop() -> bool:
             tell(state.step, steps)
-            return interrupted()
+            return bool(presses)
 
         done = run(job, state, every=every, keep=keep, stop=stop)
         if done:
@@ -82,8 +82,8 @@ def tuned_scene(state: State, job: TuningJob, convention: Convention, settings: 
 
 
 @contextmanager
-def _interruptible(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C was pressed; a second press raises KeyboardInterrupt.
+def _interruptible(say: Callable[[str], None]) -> Iterator[list[int]]:
+    """Yield a list of the presses of Ctrl-C, of which the second raises KeyboardInterrupt.
 
     Python lets only the main thread handle signals; in others nothing changes.
     """
@@ -96,10 +96,10 @@ def _interruptible(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         say("stopping after this step; press again to stop at once")
 
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield presses
         return
     before = signal.signal(signal.SIGINT, note)
     try:
-        yield lambda: bool(presses)
+        yield presses
     finally:
         signal.signal(signal.SIGINT, before)
