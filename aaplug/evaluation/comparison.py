@@ -222,17 +222,9 @@ class Comparison:
         for scene in self.scenes:
             scales = dict[str, Any]()
             for scale in report.scales:
-                views, figures = report.select(scene.name, scale), dict[str, Any]()
-                for metric in report.metrics:
-                    spread = spread_of(metric, views)
-                    figures[metric.name] = spread and {
-                        "mean": spread.mean,
-                        "median": spread.median,
-                        "worst": {"view": spread.worst[0], "value": spread.worst[1]},
-                        "spread": spread.deviation,
-                    }
+                views = report.select(scene.name, scale)
                 scales[f"{scale:g}"] = {
-                    **figures,
+                    **{metric.name: spread_of(metric, views) for metric in report.metrics},
                     "equal_views": sum(EQUAL in view.note for view in views),
                     "seconds": median(view.seconds for view in views),
                     "per_view": {v.view: {**v.values, "seconds": round(v.seconds, 4)} for v in views},

@@ -262,7 +262,11 @@ class ViewMeasurer:
         elif CEILING in self.task.rows:
             if scale == 1:
                 images[_work(truth.truth.renderer, camera)] = truth.look
-            yield CEILING, truth.look if scale == 1 else truth.look.resampled_to(truth.resized_look(scale))
+            ceiling = truth.look
+            if scale != 1:
+                rgb = truth.resized_look(scale)
+                ceiling = replace(ceiling, rgb=rgb, alpha=rgb.new_ones(rgb.shape[:2]), samples=1)
+            yield CEILING, ceiling
         for name, renderer in self._renderers.items():
             work = _work(renderer.renderer, camera)
             if work not in images:

@@ -44,10 +44,6 @@ class TimedImage:
         """The colours without the background."""
         return self.rgb - (1 - self.alpha[..., None]) * self.rgb.new_tensor(self.background)
 
-    def resampled_to(self, rgb: Float[Tensor, "h2 w2 3"]) -> "TimedImage":
-        """An opaque image made from this render, at the cost of this render."""
-        return replace(self, rgb=rgb, alpha=rgb.new_ones(rgb.shape[:2]), samples=1)
-
 
 class TimedRenderer:
     """A renderer that times its images and counts their splat-pixel evaluations where rasterizer and kernels can."""

@@ -160,27 +160,21 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return sum(defined) / len(defined) if defined else None
 
 
-@dataclass(frozen=True)
-class Spread:
-    """A metric over the views where it is defined.
+def spread_of(metric: Metric, measurements: Iterable[Measurement]) -> dict[str, Any] | None:
+    """A metric over the views where it is defined, None if it is nowhere.
 
-    worst: (view, value).  deviation: of the sample; None of one view.
+    Its mean, median, and view and value of the worst; as "spread" the sample's standard deviation, None of one view.
     """
-
-    mean: float
-    median: float
-    worst: tuple[str, float]
-    deviation: float | None
-
-
-def spread_of(metric: Metric, measurements: Iterable[Measurement]) -> Spread | None:
-    """The spread over the views; None where the metric is nowhere defined."""
     values = {m.view: value for m in measurements if (value := m.values.get(metric.name)) is not None}
     if not values:
         return None
     worst = max(values, key=lambda view: metric.loss(values[view]))
-    deviation = stdev(values.values()) if len(values) > 1 else None
-    return Spread(sum(values.values()) / len(values), median(values.values()), (worst, values[worst]), deviation)
+    return {
+        "mean": sum(values.values()) / len(values),
+        "median": median(values.values()),
+        "worst": {"view": worst, "value": values[worst]},
+        "spread": stdev(values.values()) if len(values) > 1 else None,
+    }
 
 
 def elided(text: str, most: int) -> str:
@@ -271,9 +265,9 @@ def metric_cells(report: Report, metric: Metric) -> list[list[Cell]]:
         best, cells = min(contenders, key=metric.loss, default=math.nan), list[Cell]()
         for recipe, spread in spreads.items():
             value, deviation, worst = means[recipe], "", None
-            if spread is not None and spread.deviation is not None:
-                deviation = f"± {metric.text(spread.deviation)}"
-                worst = (metric.text(spread.worst[1]), spread.worst[0]) if spread.deviation else None
+            if spread is not None and spread["spread"] is not None:
+                deviation = f"± {metric.text(spread['spread'])}"
+                worst = (metric.text(spread["worst"]["value"]), spread["worst"]["view"]) if spread["spread"] else None
             cells.append(Cell(metric.text(value), recipe != CEILING and value == best, deviation, worst))
         columns.append(cells)
     return [list(row) for row in zip(*columns, strict=True)]

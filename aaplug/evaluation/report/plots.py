@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from aaplug.evaluation.coverage import Coverage
-from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.results import CEILING, Report, elided, mean, million_evaluations, scale_name
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
@@ -41,7 +40,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "legend.frameon": False,
 }
-Value = Callable[[Report, str, float], float | None]  # by recipe and scale
+Value = Callable[[str, float], float | None]  # by recipe and scale
 
 
 @dataclass(frozen=True)
@@ -77,11 +76,14 @@ class Plot:
 
 def plots(report: Report, bounds: Coverage) -> list[Plot]:
     """The plots of a report: metrics against the truth and work over scale, and the sampling bounds."""
-    curves = [_curves(plot_name(m.name), m.title, partial(_mean, m), report) for m in report.compared]
+    curves = [
+        _curves(plot_name(m.name), m.title, lambda *at, name=m.name: mean(report.select(*at), name), report)
+        for m in report.compared
+    ]
     title = "million splat-pixel evaluations per view"
-    curves.append(_curves(EVALUATIONS, title, million_evaluations, report, from_zero=True))
-    title, above = "share of the splats' energy above the Nyquist rate", bounds.above_nyquist
-    curves.append(_curves(ABOVE_NYQUIST, title, lambda _, *at: above.get(at), report, from_zero=True))
+    curves.append(_curves(EVALUATIONS, title, partial(million_evaluations, report), report, from_zero=True))
+    title = "share of the splats' energy above the Nyquist rate"
+    curves.append(_curves(ABOVE_NYQUIST, title, lambda *at: bounds.above_nyquist.get(at), report, from_zero=True))
     share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
     return [*filter(None, curves), Plot(BOUNDS, words, partial(_histogram, bounds))]
@@ -92,17 +94,13 @@ def plot_name(metric: str) -> str:
     return re.sub(r"\W+", "-", metric.lower())
 
 
-def _mean(metric: Metric, report: Report, recipe: str, scale: float) -> float | None:
-    return mean(report.select(recipe, scale), metric.name)
-
-
 def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool = False) -> Plot | None:
     """One line per recipe over scale, from 0 if `from_zero`; None if there is nothing to draw.
 
     Lines have gaps where a value is undefined; the ceiling's is dashed and lies behind the others.
     """
     scales = sorted(report.scales)
-    values = {recipe: [value(report, recipe, scale) for scale in scales] for recipe in report.recipes}
+    values = {recipe: [value(recipe, scale) for scale in scales] for recipe in report.recipes}
     if all(v is None for line in values.values() for v in line):
         return None
 
