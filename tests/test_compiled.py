@@ -27,7 +27,7 @@ from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.projection import project
 from aaplug.core.training import TrainingViews
-from aaplug.gsplat.choice import OnlyCompiled
+from aaplug.gsplat.drawing import OnlyCompiled
 from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels import point
 from aaplug.methods.pixel_kernels.point import POINT

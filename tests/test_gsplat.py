@@ -28,8 +28,8 @@ from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
 from aaplug.gsplat import patch, rasterization, rasterization_2dgs
 from aaplug.gsplat.arguments import FIXED
-from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.discs import normals_of_depth
+from aaplug.gsplat.drawing import rasterizer_of
 from aaplug.gsplat.on_cuda_alone import compute_relocation, quat_scale_to_covar_preci, spherical_harmonics
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
@@ -935,7 +935,7 @@ def test_nothing_is_compiled_for_tensors_that_no_kernel_takes(dtype, device, cap
 
 @pytest.mark.parametrize(("dtype", "later"), [(F64, ""), (torch.float32, ", and compiles it meanwhile")])
 def test_compiled_is_never_eager_without_a_word(monkeypatch, dtype, later):
-    monkeypatch.setattr("aaplug.gsplat.choice.find_rasterizer", lambda name, frames, gradients: Tiled(EAGER))
+    monkeypatch.setattr("aaplug.gsplat.drawing.find_rasterizer", lambda name, frames, gradients: Tiled(EAGER))
     monkeypatch.setattr("aaplug.gsplat.drop_in.rasterizer_of", rasterizer_of.__wrapped__)
     call, problem = gaussians(dtype=dtype) | two_views(dtype), f"is compiled for {str(dtype)[6:]} "
     with pytest.raises(UsageError, match=rf"^rasterizer: no kernel 'composite-point' {problem}.*\beagerly{later}$"):

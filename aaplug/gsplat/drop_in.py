@@ -12,8 +12,7 @@ from aaplug.core.conventions import CLASSIC, MAX_KERNEL
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
-from aaplug.gsplat.choice import rasterizer_of
-from aaplug.gsplat.drawing import drawer, features_of, finished, splats_of
+from aaplug.gsplat.drawing import drawer, features_of, finished, rasterizer_of, splats_of
 from aaplug.gsplat.table import Layout, conics
 from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT

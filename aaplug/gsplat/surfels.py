@@ -13,9 +13,8 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, refuse, views_of
-from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.discs import Discs, distortion, median_depth, normals_of_depth, splats_of
-from aaplug.gsplat.drawing import drawer, features_of, finished
+from aaplug.gsplat.drawing import drawer, features_of, finished, rasterizer_of
 from aaplug.gsplat.drop_in import Above0, From0, Kernel, MaxAlpha
 from aaplug.gsplat.table import Layout
 from aaplug.methods.pixel_kernels.surfel import SURFEL

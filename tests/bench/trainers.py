@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 import aaplug.gsplat
-from aaplug.gsplat.choice import rasterizer_of
+from aaplug.gsplat.drawing import rasterizer_of
 from aaplug.rasterizers.choice import kernels_of
 from aaplug.rasterizers.tiled.ahead_of_time import TRAINER_KERNELS, build
 from aaplug.rendering.benchmark import synthetic_camera, synthetic_scene
