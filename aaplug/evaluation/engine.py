@@ -74,10 +74,7 @@ class Task:
     ceiling: bool = True
 
     def __post_init__(self) -> None:
-        """Raises UsageError: there is nothing to measure, or a view lacks the photograph it needs.
-
-        So does a scale to which the protocol does not downscale photographs.
-        """
+        """Raises UsageError: nothing is to be measured, or a view or scale lacks the photograph that it needs."""
         if not (self.renderers and self.scales and self.views):
             raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
         for each in self.renderers.values():

@@ -136,14 +136,12 @@ def _measurement(line: Any) -> Measurement:
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:
-    """Lock the journal for this process; the system releases the lock when the process ends."""
     if lock(stream.fileno()) is False:
         raise UsageError(str(path), "another process is writing it")
 
 
 @contextmanager
 def _named_errors(path: Path) -> Iterator[None]:
-    """Name the journal in an error of the system."""
     try:
         yield
     except OSError as error:

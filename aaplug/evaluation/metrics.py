@@ -1,7 +1,6 @@
 """Metrics: those that compare an image with a truth, and figures of one renderer, which need no truth.
 
 Images are [h, w, 3] in [0, 1].  A value that is not defined (images too small) or infinite (equal images) is None.
-A package adds a metric by an entry point in the group "aaplug.metrics": a `Metric` with a `measure` of image and truth.
 
 SSIM comes in the two flavours that the field's tables mix: "wang" crops the border that the window overhangs, as
 scikit-image with Gaussian weights and torchmetrics do; "3dgs" pads with zeros and keeps the border, as 3DGS's own

@@ -79,8 +79,7 @@ class Truth:
     """The images to compare with.
 
     renderer: renders the scene by training's rule (see `rendering.renderer.own_look`), or the reference by its recipe.
-    enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
-        photographs, undefined.
+    enlarge: estimates ground truth above the source's size, if given.
     memory: bytes of 16-bit images to cache between calls; None caches none.
     """
 

@@ -76,8 +76,7 @@ def rasterization_2dgs(
         has the gradient that gsplat's densification reads.
 
     Raises:
-        UsageError: something is not supported or out of range, shapes do not fit each other, memory does not hold an
-            image, or no compiled kernel takes what "compiled" was asked for.
+        UsageError: as `rasterization`; also, there is no such `depth_mode`.
     """
     if depth_mode not in DEPTH_MODES:
         raise UsageError("depth_mode", not_one_of(depth_mode, DEPTH_MODES))

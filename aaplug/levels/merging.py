@@ -162,10 +162,7 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
 
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-    """Order by chunk, in each along a curve, and at one place by the other parameters.
-
-    So the scene's own order plays no part.
-    """
+    """Order by chunk, in each along a curve, and at one place by the other parameters: never by the scene's own."""
 
     def ordered(rows: Int[Tensor, " r"], keys: Sequence[Tensor]) -> Int[Tensor, " r"]:
         for key in keys:
@@ -195,10 +192,7 @@ def _merge_matching(clusters: Clusters, pairs: Edges) -> tuple[Clusters, Int[Ten
 
 
 def _hidden(scene: Gaussians, clusters: Clusters, rate: float) -> Bool[Tensor, " n"]:
-    """True where alpha lies below the cut-off in every pixel of the level, along each of three directions.
-
-    Also where views show a smaller share than the cut-off.
-    """
+    """True where alpha in every pixel of the level, along each axis, or the visible share lies below the cut-off."""
     px = clusters.rates * rate
     raw = covariances(scene)
     trained = blur(raw, scene.convention.kernel / clusters.rates.square())

@@ -1,13 +1,9 @@
 """Registries of everything that is chosen by name, from aaplug and from installed plug-ins.
 
-A package adds an entry by an entry point in the group of its kind, for example in its pyproject.toml:
-
-    [project.entry-points."aaplug.screen_filters"]
-    sharp = "their_package.sharp:SHARP"
-
-The entry's name is the name in the registry.  An object with a `name` of its own must agree with it.  A plug-in that
-cannot be used is left out with a warning, so that it does not stop everything else.  An entry is imported when it is
-first used, so that names can be listed without importing anything.
+A package adds an entry by an entry point in the group of its kind (examples/guides/contributing.md).  The entry's name
+is the name in the registry.  An object with a `name` of its own must agree with it.  A plug-in that cannot be used is
+left out with a warning, so that it does not stop everything else.  An entry is imported when it is first used, so that
+names can be listed without importing anything.
 """
 
 import logging

@@ -1,8 +1,4 @@
-"""The files of an evaluation and of a comparison of scenes.
-
-An evaluation: results.json, per_view.json, results.csv.  A comparison: compare.json, compare.csv and contact-sheet.png.
-Of both: report.html and its plots.
-"""
+"""The files of an evaluation, of a comparison of scenes, and of both: a page with its plots."""
 
 import json
 from collections.abc import Mapping, Sequence
