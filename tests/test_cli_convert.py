@@ -10,8 +10,8 @@ import torch
 from aaplug.core.conventions import MIP, PLAYCANVAS
 from aaplug.core.gaussians import Fusion
 from aaplug.evaluation.engine import evaluate
-from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tuned_scene
+from aaplug.finetuning.state import between
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 

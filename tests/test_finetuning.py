@@ -19,10 +19,9 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.fitting import fit
-from aaplug.finetuning.loop import advance, loss_at, run
-from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
-from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, l2, slowed
-from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
+from aaplug.finetuning.loop import advance, extent, least_log_scales, loss_at, run
+from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, RATES, Settings, balance, l2, slowed
+from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, between, leaves_of, load, save, scene_of
 from aaplug.io.images import write_png
 from aaplug.lab import mipmap_gs
 from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup

@@ -10,8 +10,7 @@ from dataclasses import replace
 import pytest
 from aaplug_cli.verbs import VERBS
 
-from aaplug.finetuning.parameters import RATES
-from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settings_of
+from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, RATES, settings_of
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError

@@ -19,8 +19,7 @@ from aaplug.io.images import read_image, write_png
 from aaplug.live import pictures
 from aaplug.live.messages import PickRequest, PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
-from aaplug.live.page import Page
-from aaplug.live.pictures import Pictures
+from aaplug.live.pictures import Page, Pictures
 from aaplug.live.subject import Subject
 from aaplug.methods.recipe import LevelChoice
 from aaplug.rendering.renderer import Renderer

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from aaplug.live.messages import PictureRequest, Side, parse
-from aaplug.live.page import Page
+from aaplug.live.pictures import Page
 from aaplug.live.subject import Subject
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError, UsageError

@@ -14,10 +14,9 @@ from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.results import Report, mean_square_error
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
-from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import QUICK_SETTINGS, SHARED_SETTINGS, balance, slowed
-from aaplug.finetuning.state import TuningJob
+from aaplug.finetuning.state import TuningJob, between
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer

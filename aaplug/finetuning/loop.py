@@ -1,5 +1,8 @@
 """The optimization loop: render a view at a scale, compare it with ground truth, take an Adam step, clamp parameters.
 
+No Gaussian may become thinner than its sampling bound, or than it was if it was thinner: no training view could resolve
+less than √0.2 px at its highest rate (Mip-Splatting, section 5.1).
+
 Runs are reproducible: the view and scale of step t depend only on the seed and t.  A run that was stopped and resumed
 therefore equals an uninterrupted one, bit for bit.
 """
@@ -12,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.sampling import sampling_bounds
+from aaplug.core.sampling import SamplingBounds, sampling_bounds
 from aaplug.finetuning import LOSSES
-from aaplug.finetuning.parameters import extent, least_log_scales
 from aaplug.finetuning.settings import SEED_STRIDE, Settings
 from aaplug.finetuning.state import State, TuningJob
+from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import PlugInError, UsageError
@@ -26,6 +29,7 @@ BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Spl
 MAX_LOGIT = 9.0  # largest opacity logit: opacity 0.9999, where the sigmoid's gradient is nearly 0
 MAX_BAD_STEPS = 18  # consecutive steps without finite gradients that end a run
 SCALE_SEED = 3_000_000  # added for the scale of a step
+EXTENT_MARGIN = 1.1  # times the training cameras' farthest distance from their mean (3DGS)
 
 
 def run(
@@ -142,6 +146,19 @@ def view_and_weights(settings: Settings, views: Sequence[Camera], step: int) -> 
     if settings.anchor:
         weights[1.0] = weights.get(1.0, 0.0) + settings.anchor
     return view, weights
+
+
+def extent(cameras: Sequence[Camera]) -> float:
+    """The scene's size in world units, from the spread of its training cameras (3DGS)."""
+    centres = torch.stack([camera.centre for camera in cameras])
+    spread = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
+    return EXTENT_MARGIN * spread if spread > 0 else 1.0
+
+
+def least_log_scales(first: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
+    """ln of the least standard deviation that each axis may take, given the one it had at first."""
+    floor = 0.5 * torch.log(torch.tensor(NYQUIST_VARIANCE)) - bounds.highest_or_coarsest.log()
+    return torch.minimum(first, floor.to(first)[:, None])
 
 
 @torch.no_grad()

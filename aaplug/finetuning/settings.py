@@ -8,13 +8,21 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import FAST, Viewer
 from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
 from aaplug.system.errors import UsageError
 
 ROUNDING_ERROR = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 SEED_STRIDE = 10_000_019  # from one of the user's seeds to the next
+LEARNED_COLUMNS = "learned"  # leaf of the extras that hold learned filters, if the scene has any
+RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "logit_opacities": 5e-2,
+    "dc": 2.5e-3,
+    "rest": 2.5e-3 / 20,
+}
 
 
 @dataclass(frozen=True)

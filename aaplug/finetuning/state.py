@@ -1,12 +1,15 @@
 """The work of a run, its state, and its checkpoints.
 
+n: Gaussians.  The scene is kept as leaves that an optimizer moves.  Colours are two of them, the constant (dc) and the
+other harmonics (rest), because 3DGS gives them learning rates of their own.
+
 A checkpoint is one file of everything that the next step depends on, written whole or not at all.  It is torch's, of
 tensors, numbers and strings only, and is read as such: nothing in it is executed.
 """
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -21,8 +24,7 @@ from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
-from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
-from aaplug.finetuning.settings import CONSISTENCY, Method, Settings
+from aaplug.finetuning.settings import CONSISTENCY, LEARNED_COLUMNS, Method, Settings
 from aaplug.io.atomic import replacing
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
@@ -33,6 +35,38 @@ from aaplug.system.locks import scratch
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
 FORMAT, VERSION = "aaplug finetune", 10  # of a checkpoint
+WHOLE = ("means", "quats", "log_scales", "logit_opacities")  # leaves that are columns of the scene
+SATURATED = 1e3  # a logit or log-scale that looks like an infinite one, in float64 too
+
+Leaves = dict[str, Tensor]
+
+
+def leaves_of(scene: Gaussians) -> Leaves:
+    """Copies of every parameter; infinite ones become finite numbers of the same look, which steps can average."""
+    leaves = {name: getattr(scene, name) for name in WHOLE} | {"dc": scene.sh[:, :1], "rest": scene.sh[:, 1:]}
+    if scene.learned:
+        leaves[LEARNED_COLUMNS] = torch.stack([scene.extras[name] for name in scene.learned], dim=1)
+    ends = {"nan": torch.nan, "posinf": SATURATED, "neginf": -SATURATED}
+    return {name: value.detach().nan_to_num(**ends) for name, value in leaves.items()}
+
+
+def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
+    """The scene that the leaves stand for.
+
+    If densification changed the number of Gaussians, the link to the rows of the source file is dropped.
+    """
+    values = {name: leaves[name] for name in WHOLE}
+    sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
+    if len(sh) != len(like):
+        return replace(like, **values, sh=sh, origin=None, extras={})
+    learned = zip(like.learned, leaves[LEARNED_COLUMNS].unbind(dim=1), strict=True) if like.learned else ()
+    return replace(like, **values, sh=sh, extras={**like.extras, **dict(learned)})
+
+
+def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
+    """Interpolate two scenes of equally many Gaussians, parameter by parameter: 0 gives the start, 1 the end."""
+    first, last = leaves_of(start), leaves_of(end)
+    return scene_of({n: first[n].lerp(last[n], share) for n in first}, end)
 
 
 @dataclass(frozen=True, eq=False)

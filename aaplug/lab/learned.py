@@ -20,8 +20,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.finetuning.parameters import LEARNED_COLUMNS
-from aaplug.finetuning.settings import Method, Settings
+from aaplug.finetuning.settings import LEARNED_COLUMNS, Method, Settings
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.viewers import FAST
 

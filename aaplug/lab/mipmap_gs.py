@@ -15,10 +15,9 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import rotation_matrices
-from aaplug.finetuning.loop import update_bounds
-from aaplug.finetuning.parameters import RATES, WHOLE, extent, leaves_of
-from aaplug.finetuning.settings import SEED_STRIDE, Method, Settings
-from aaplug.finetuning.state import State, TuningJob, optimizer
+from aaplug.finetuning.loop import extent, update_bounds
+from aaplug.finetuning.settings import RATES, SEED_STRIDE, Method, Settings
+from aaplug.finetuning.state import WHOLE, State, TuningJob, leaves_of, optimizer
 from aaplug.methods.viewers import CLASSIC_VIEWER
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.errors import UsageError

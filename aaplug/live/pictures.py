@@ -5,12 +5,15 @@ request.  A picture goes to the page as one binary message: the length of a head
 as JSON, and the files of its parts, one after another.
 """
 
+import asyncio
 import json
+import logging
 import math
 import struct
 import time
+from collections import deque
 from collections.abc import Generator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -30,6 +33,7 @@ from aaplug.live.subject import Subject
 from aaplug.methods import QUALITIES
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
+from aaplug.system.errors import AaplugError, UsageError, printable
 
 PREVIEW_QUALITY, RESTING_QUALITY = 85, 95  # of JPEG
 MAX_LOSSLESS_PIXELS = 400_000  # of a picture at rest that is sent as PNG, so that single pixels are true
@@ -41,9 +45,13 @@ EFFORT_RANGE = 1 / 16, 16.0
 EFFORT_STEP_RANGE = 0.6, 1.4  # factors from frame to frame
 MAX_SAMPLES = 1 << 24  # of one side: about a second
 PROBE_GAUSSIANS = 20_000  # by which a moving picture's sampling rate is estimated
+MAX_IN_FLIGHT = 2  # pictures that are sent and have not arrived, so that a slow line delays no newer one
+MAX_WAITING_ORDERS = 4  # more are refused
 
 Span = tuple[int, int]  # columns of the picture: the first, and one past the last
 Steps = Generator[bytes | None, None, None]
+
+log = logging.getLogger("aaplug")
 
 
 class Part(NamedTuple):
@@ -186,6 +194,64 @@ class Pictures:
         values = None if placed.width > image_size(view.photo)[0] else values
         whole = placed.hw == (rows[1] - rows[0], columns[1] - columns[0])
         return _part_at_rest("photo", columns, photo), {"psnr": values, "rows": rows, "whole": whole}
+
+
+@dataclass(eq=False)
+class Page:
+    """A page that shows a subject; one thread takes its steps, another receives its messages.
+
+    newer: True if no step for the request is taken yet.  changed: set when it wants something else.
+    sent, received: counts of pictures.
+    """
+
+    subject: Subject
+    request: PictureRequest | None = None
+    newer: bool = False
+    steps: Steps | None = None
+    orders: deque[Order] = field(default_factory=deque)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    sent: int = 0
+    received: int = 0
+
+    def __post_init__(self) -> None:
+        self.pictures = Pictures(self.subject)
+
+    def receive(self, said: PictureRequest | Order | None) -> None:
+        """Take a message of the page, as `parse` gives it; raises UsageError if it wants more than it may."""
+        match said:
+            case PictureRequest():
+                self.request, self.newer = said, True
+            case None:
+                self.received = min(self.sent, self.received + 1)
+            case _ if self.request is None or len(self.orders) >= MAX_WAITING_ORDERS:
+                raise UsageError("still", "wait until the ones before are done")
+            case _:
+                self.orders.append(said)
+        self.changed.set()
+
+    @property
+    def busy(self) -> bool:
+        """True if there is a step to take now."""
+        return self.sent - self.received < MAX_IN_FLIGHT and bool(self.newer or self.steps or self.orders)
+
+    def step(self) -> bytes | None:
+        """Take one step, and return what it has to send; a newer request replaces what is being drawn."""
+        assert self.request is not None
+        try:
+            if self.newer:
+                self.newer = False  # before the request is read: the next one may come at any time
+                self.steps = self.pictures.steps(self.request)
+            elif self.steps is None:
+                self.steps = self.pictures.ordered(self.request, self.orders.popleft())
+            return next(self.steps)
+        except StopIteration:
+            self.steps = None
+            return None
+        except Exception as error:  # one picture fails, the page goes on
+            self.steps = None
+            if not isinstance(error, AaplugError | MemoryError):
+                log.warning("a picture failed: %r", error)
+            return message({"problem": printable(str(error) or "out of memory")}, [])
 
 
 def message(header: dict[str, Any], files: list[bytes]) -> bytes:

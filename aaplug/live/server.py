@@ -31,8 +31,7 @@ from websockets.http11 import Request, Response
 
 from aaplug.live import webpage
 from aaplug.live.messages import MAX_MESSAGE_BYTES, OpenRequest, parse
-from aaplug.live.page import Page
-from aaplug.live.pictures import message
+from aaplug.live.pictures import Page, message
 from aaplug.live.subject import Subject
 from aaplug.system.errors import AaplugError, UsageError, reason
 from aaplug.system.executors import given_threads

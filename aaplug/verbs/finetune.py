@@ -22,10 +22,9 @@ from aaplug.evaluation.results import Report, figure_of, mean_square_error, resu
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
-from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.poses import refined
 from aaplug.finetuning.session import PROBE_VIEWS, tune, tuned_scene
-from aaplug.finetuning.settings import Settings, settings_of, slowed
+from aaplug.finetuning.settings import LEARNED_COLUMNS, Settings, settings_of, slowed
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, write_file
 from aaplug.io.images import image_size, write_png
