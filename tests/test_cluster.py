@@ -233,7 +233,7 @@ def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_
 def test_a_worker_that_does_not_see_the_folder_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(address="tcp://far:1"))
     with pytest.raises(UsageError, match=r"worker tcp://far:1: does not see .*work\.pt: it needs the same file system"):
-        cluster._work(str(tmp_path / "work.pt"))
+        cluster._call(str(tmp_path / "work.pt"), cluster.VERSIONS, None)
 
 
 def test_a_cluster_without_workers_or_without_a_folder_is_refused(monkeypatch):

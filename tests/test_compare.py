@@ -306,7 +306,7 @@ def test_views_measured_in_processes_are_the_same(cli, monkeypatch, tmp_path):
 
     def sent(work, items):
         save(work, tmp_path / "work.pt")
-        return map(load(tmp_path / "work.pt"), items)
+        return map(load(str(tmp_path / "work.pt")), items)
 
     scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     given = {"a": scene, "b": replace(scene, convention=MIP)}

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -31,7 +30,6 @@ from distributed.core import rpc
 from distributed.security import Security
 from distributed.utils import LoopRunner
 
-from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, counted, listing, reason
 from aaplug.system.executors import ITEMS_PER_WORKER, WORK_FILE_NAME, load, results, save, track_quietly
 from aaplug.system.locks import scratch
@@ -42,7 +40,6 @@ SCHEDULER_ADDRESS = re.compile(r"\w+://\S+:\d+", re.ASCII)
 ANSWER_SECONDS = 10.0  # a scheduler answers and has a worker by then
 LOOK_SECONDS = 1.0  # between two counts of the workers
 ABSENT_SECONDS = 60.0  # without any worker, after which the cluster counts as lost
-SCENES_PER_WORKER = 4  # in memory; so many callers can share a cluster
 VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # results depend on these
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # the caller hears Ctrl-C
 LEAN_WORKERS = {  # no variables that would stay in our own environment, too, and no sampling profiler
@@ -260,14 +257,8 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
     """The result of one item; a worker that came after the caller's check is checked here."""
     for package, expected in versions.items():
         _refuse_other(get_worker().address, package, VERSIONS[package], expected)
-    with _one_item:
-        torch.set_num_threads(1)  # of this thread, and for good
-        return _work(path)(item)
-
-
-@lru_cache(SCENES_PER_WORKER)
-def _work(path: str) -> Callable[[Any], Any]:
     if not os.path.exists(path):
         raise ClusterError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
-    keep_freed_memory()  # Dask forbids its workers, which takes most of their time
-    return load(path)
+    with _one_item:
+        torch.set_num_threads(1)  # of this thread, and for good
+        return load(path)(item)

@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolE
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
@@ -39,6 +40,7 @@ WORK_FILE_NAME = "work.pt"  # file with the function of the workers, in a folder
 PAYS_AFTER_SECONDS = 20.0  # two processes take five seconds to start, and save two fifths
 WINDOWS_PROCESSES = 61  # that a pool can have there
 ITEMS_PER_WORKER = 2  # waiting or at work, so that no worker is idle
+SCENES_PER_WORKER = 4  # in memory; so many callers can share a cluster
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -93,9 +95,10 @@ class Processes:
             OutputError: there is no room for the file of `work`.
         """
         with scratch() as folder:
+            path = folder / WORK_FILE_NAME
             try:
-                save(work, folder / WORK_FILE_NAME)
-                needs = needs_script(folder / WORK_FILE_NAME)
+                save(work, path)
+                needs = needs_script(path)
                 alone = needs and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or "")
             except OfThisProcessError:
                 needs = alone = True
@@ -108,7 +111,7 @@ class Processes:
             pool = ProcessPoolExecutor(workers, context, _start, (str(folder),))
             try:
                 most = ITEMS_PER_WORKER * workers
-                yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
+                yield from results(lambda item: pool.submit(_call, str(path), item), items, lambda: most, self.ordered)
             except (KeyboardInterrupt, GeneratorExit, SystemExit):  # the items at work need not be finished
                 for process in getattr(pool, "_processes", None) or {}:
                     with suppress(OSError):
@@ -249,8 +252,10 @@ def needs_script(path: Path) -> bool:
         return any(b"__main__" in archive.read(name) for name in archive.namelist() if name.endswith("/data.pkl"))
 
 
-def load(path: str | Path) -> Callable[[Any], Any]:
-    """Return what `save` wrote; its tensors stay in the file until they are read."""
+@lru_cache(SCENES_PER_WORKER)
+def load(path: str) -> Callable[[Any], Any]:
+    """Return what `save` wrote, for a worker process; its tensors stay in the file until they are read."""
+    keep_freed_memory()  # Dask forbids its workers, which takes most of their time
     return torch.load(path, mmap=True, weights_only=False)  # our own file
 
 
@@ -270,12 +275,8 @@ def track_quietly() -> None:
         sys.warnoptions.remove(QUIET_TRACKER)
 
 
-_work: Callable[[Any], Any] | None = None  # function of this worker process
-
-
 def _start(folder: str) -> None:
-    """Begin a worker process: load the work, and end with the parent if that dies without shutting the pool down."""
-    global _work
+    """Begin a worker process, which ends with the parent if that dies without shutting the pool down."""
 
     def end_with_parent() -> None:
         parent = multiprocessing.parent_process()
@@ -286,14 +287,11 @@ def _start(folder: str) -> None:
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     end_as_worker()
-    keep_freed_memory()
     torch.set_num_threads(1)
-    _work = load(Path(folder) / WORK_FILE_NAME)
 
 
-def _call(item: Any) -> Any:
-    assert _work is not None
+def _call(path: str, item: Any) -> Any:
     try:
-        return _work(item)
+        return load(path)(item)
     except SystemExit as end:  # the pool would go on with the next item
         os._exit(end.code if isinstance(end.code, int) else 1)
