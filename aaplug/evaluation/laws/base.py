@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -16,6 +17,7 @@ from aaplug.core.splats import Splats2D
 F64 = torch.float64
 LAWS: dict[str, list[Callable[[Any], None]]] = {}  # by kind
 L = TypeVar("L", bound=Callable[[Any], None])
+T = TypeVar("T", Splats2D, Gaussians)
 
 
 def law_of(kind: str) -> Callable[[L], L]:
@@ -45,25 +47,23 @@ def require_same(thing: Splats2D | Gaussians, before: dict[str, Tensor], problem
         require(getattr(thing, name).equal(value), f"{problem} {name}")
 
 
-def require_gradients(
-    function: Callable[..., Mapping[str, Any]], inputs: Mapping[str, Tensor], of: Sequence[str]
-) -> None:
-    """Raise AssertionError unless autograd's gradient of these outputs by the inputs is that of small differences.
+def require_gradients(change: Callable[[T], T], thing: T, inputs: Sequence[str], of: Sequence[str]) -> None:
+    """Raise AssertionError unless autograd's gradient of these columns of a changed thing is that of small differences.
 
-    function: takes the inputs in their order.
+    inputs: the columns of the thing by which it is taken.
     """
 
     def outputs(*values: Tensor) -> tuple[Tensor, ...]:
-        found = function(*values)
+        found = change(replace(thing, **dict(zip(inputs, values, strict=True))))
         attached = sum(0.0 * value.sum() for value in values)  # gradcheck passes by an output that is detached
-        return tuple(found[name] + attached for name in of)
+        return tuple(getattr(found, name) + attached for name in of)
 
     try:
-        torch.autograd.gradcheck(outputs, [value.clone().requires_grad_() for value in inputs.values()])
+        torch.autograd.gradcheck(outputs, [getattr(thing, name).clone().requires_grad_() for name in inputs])
     except GradcheckError as error:
         if not (found := re.search(r"output (\d+) with respect to input (\d+)", str(error))):
             raise
-        output, by = of[int(found[1])], [*inputs][int(found[2])]
+        output, by = of[int(found[1])], inputs[int(found[2])]
         problem = f"the gradient of {output} by {by} is not that of small differences"
         raise AssertionError(f"{problem}, or two calls differ") from error
 

@@ -7,10 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import Gaussians
@@ -126,15 +124,10 @@ def keeps_huge_splats(screen: ScreenFilter) -> None:
 def has_gradients_on_screen(screen: ScreenFilter) -> None:
     """Its gradient is that of its formula."""
     splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
-    inputs = {name: getattr(splats, name) for name in ("covs", "dets", "depths", "opacities")}
+    inputs, outputs = ("covs", "dets", "depths", "opacities"), ("covs", "dets", "opacities")
     # not at the training size, where the range of rates ends at the view itself: that is a kink
     for view, training in list(SITUATIONS.values())[1:]:
-
-        def filtered(*values: Tensor) -> dict[str, Any]:
-            given = replace(splats, **dict(zip(inputs, values, strict=True)))
-            return vars(screen(given, view, training))  # noqa: B023 (called in the same turn)
-
-        require_gradients(filtered, inputs, ("covs", "dets", "opacities"))
+        require_gradients(lambda given: screen(given, view, training), splats, inputs, outputs)  # noqa: B023
 
 
 def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) -> Gaussians:
@@ -192,13 +185,6 @@ def never_shrinks_gaussians(world: WorldFilter) -> None:
 def has_gradients_in_the_world(world: WorldFilter) -> None:
     """Its gradient is that of its formula."""
     scene = world_scene()[torch.arange(2)]
-    training = TrainingViews.of(scene, CAMERAS)
-
-    assert scene.filter_3d is not None
-    logits = scene.logit_opacities - 2
-    inputs = {"log_scales": scene.log_scales, "logit_opacities": logits, "filter_3d": scene.filter_3d}
-
-    def filtered(*values: Tensor) -> dict[str, Any]:
-        return vars(world(replace(scene, **dict(zip(inputs, values, strict=True))), training))
-
-    require_gradients(filtered, inputs, ("log_scales", "logit_opacities"))
+    training, fainter = TrainingViews.of(scene, CAMERAS), replace(scene, logit_opacities=scene.logit_opacities - 2)
+    outputs = ("log_scales", "logit_opacities")
+    require_gradients(lambda given: world(given, training), fainter, (*outputs, "filter_3d"), outputs)
