@@ -5,14 +5,13 @@ the scene's order nor on the number of threads.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
 from aaplug.core.chunks import curve, squeezed
 from aaplug.core.convolution import fuse_stored
@@ -163,18 +162,10 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     """Order by chunk, in each along a curve, and at one place by the other parameters: never by the scene's own."""
-
-    def ordered(rows: Int[Tensor, " r"], keys: Sequence[Tensor]) -> Int[Tensor, " r"]:
-        for key in keys:
-            rows = rows[torch.argsort(key[rows], stable=True)]
-        return rows
-
-    keys = curve(squeezed(scene.means.double())), chunks
-    order = ordered(torch.arange(len(scene)), keys)
-    same = torch.stack([key[order].diff() == 0 for key in keys]).all(dim=0)
-    tied = pad(same, (1, 0)) | pad(same, (0, 1))
     shape = [scene.logit_opacities, *scene.log_scales.unbind(dim=1), *scene.sh[:, 0].unbind(dim=1)]
-    order[tied] = ordered(order[tied], (*shape, *scene.means.unbind(dim=1), *keys))
+    order = torch.arange(len(scene))
+    for key in (*shape, *scene.means.unbind(dim=1), curve(squeezed(scene.means.double())), chunks):
+        order = order[torch.argsort(key[order], stable=True)]
     return order
 
 
