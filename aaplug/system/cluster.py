@@ -201,12 +201,9 @@ def _client(address: str) -> Client:
 
 async def _kind(address: str) -> str:
     """What of Dask answers at an address; `Client` would wait for ever where something listens and says nothing."""
-
-    async def asked() -> dict[str, Any]:
-        async with rpc(address, connection_args=Security().get_connection_args("client")) as there:
-            return cast(dict[str, Any], await there.identity())
-
-    return (await asyncio.wait_for(asked(), ANSWER_SECONDS))["type"]
+    arguments = Security().get_connection_args("client")
+    async with asyncio.timeout(ANSWER_SECONDS), rpc(address, connection_args=arguments) as there:
+        return cast(dict[str, Any], await there.identity())["type"]
 
 
 def _local(workers: int, folder: Path) -> LocalCluster:
