@@ -96,7 +96,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             texts = {data: as_json(comparison.summary()), table: as_csv({rows[0].name: report})}
             files = write_texts(folder, texts, replaces)
             title = f"{rows[0].name} and {', '.join(scene.name for scene in rows[1:])}"
-            files += write_page(folder, title, report, bounds, images, replaces, comparison.facts())
+            files += write_page(title, report, bounds, images, replaces, comparison.facts())
             write_png(folder / sheet, _sheet(comparison, task), overwrite=replaces)
             for file in [*files, folder / sheet]:
                 say(f"wrote {file}")

@@ -88,7 +88,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             files = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), replaces)
             if options.report:
                 bounds = task.coverage(job.scene.gaussians(), look.training)
-                files += write_page(folder, name, report, bounds, images, replaces)
+                files += write_page(name, report, bounds, images, replaces)
             for written in files:
                 job.monitor.say(f"wrote {written}")
     return report

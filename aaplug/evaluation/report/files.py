@@ -47,22 +47,16 @@ def remove_run(folder: Path) -> None:
 
 
 def write_page(
-    folder: str | PathLike[str],
-    name: str,
-    report: Report,
-    bounds: Coverage,
-    images: ImageStore,
-    overwrite: bool,
-    facts: Sequence[Facts] = (),
+    name: str, report: Report, bounds: Coverage, images: ImageStore, overwrite: bool, facts: Sequence[Facts] = ()
 ) -> list[Path]:
-    """Write report.html, and its plots as PNG and SVG into plots/; return both paths.  facts: further tables."""
+    """Write report.html beside its images, its plots into plots/; return both paths.  facts: further tables."""
     # matplotlib takes most of a second to import
     from aaplug.evaluation.report.plots import plots
     from aaplug.evaluation.report.webpage import page
 
     figures = plots(report, bounds)
-    paths = write_texts(folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
-    beside = make_folder(Path(folder) / PLOTS)
+    paths = write_texts(images.folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
+    beside = make_folder(images.folder / PLOTS)
     for plot in figures:
         for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
             write_file(beside / (plot.name + suffix), data, overwrite=True)
