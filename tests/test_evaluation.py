@@ -251,6 +251,8 @@ EDITS = [
     ("name", "a"),  # another name
     ("values", {"PSNR": 30.0, "FLIP": 0.1}),  # another metric
     ("values", {"PSNR": 30.0}),  # a metric less
+    ("values", {"PSNR": 30.0, "SSIM": 0.9}),  # other numbers
+    ("seconds", 1.0),  # another time
     ("values", {"PSNR": math.nan, "SSIM": 1.0}),  # no number
     ("seconds", math.inf),  # no finite time
     ("samples", None),  # no samples

@@ -160,7 +160,7 @@ def evaluate(
     if len({view.name for view in task.views}) < len(task.views):  # as views of two splits may
         task = replace(task, views=[replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(task.views)])
     request = _request(task) | dict(facts or {})
-    with Journal(journal, request, resume, partial(_answers, task)) as finished:
+    with Journal(journal, request, resume) as finished:
         remaining = [index for index in range(len(task.views)) if index not in finished.views]
         tell(len(finished.views), len(task.views))
         for index, measurements in apply(ViewMeasurer(task, images), remaining) if remaining else ():
@@ -169,17 +169,6 @@ def evaluate(
     rows, measurements = task.rows, [m for index in sorted(finished.views) for m in finished.views[index]]
     measurements.sort(key=lambda m: (rows.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
-
-
-def _answers(task: Task, view: int, measurements: Sequence[Measurement]) -> bool:
-    """True if these are the measurements that the task asks for of the view in this place."""
-    cases = sorted(product(task.rows, task.scales))
-    metrics = {metric.name for metric in task.measured}
-    return (
-        0 <= view < len(task.views)
-        and sorted((m.recipe, m.scale) for m in measurements) == cases
-        and all(m.view == task.views[view].name and set(m.values) == metrics for m in measurements)
-    )
 
 
 def _request(task: Task) -> dict[str, Any]:

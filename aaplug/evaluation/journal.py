@@ -1,14 +1,13 @@
 """The journal of an evaluation: finished views on disk, so that an interrupted evaluation can continue.
 
-A file of JSON lines: the request first, then one line per view, synced to disk once the view's images are stored.  A
-line that was cut short is dropped and written again.  Numbers come back exactly, so a continued evaluation gives what
-an uninterrupted one does.
+A file of JSON lines: the request first, then one line per view with its hash, synced to disk once the view's images are
+stored.  A line that was cut short is dropped and written again.  Numbers come back exactly, so a continued evaluation
+gives what an uninterrupted one does.
 """
 
 import json
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from os import PathLike
@@ -16,29 +15,22 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from aaplug.evaluation.results import Measurement
+from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, OutputError, UsageError, listing, reason
 from aaplug.system.locks import lock
 
 JOURNAL = "progress.jsonl"
+HASH = "sha256"  # of what else a line holds
 ANEW = "remove the file to start again"  # `overwrite` would start all scenes of a batch again
-
-Fits = Callable[[int, Sequence[Measurement]], bool]
 
 
 class Journal:
     """An open journal; a context manager.  views: measurements of the finished views, by their place in the request."""
 
-    def __init__(
-        self,
-        path: str | PathLike[str] | None,
-        request: Mapping[str, Any],
-        resume: bool,
-        fits: Fits = lambda view, measurements: True,
-    ):
+    def __init__(self, path: str | PathLike[str] | None, request: Mapping[str, Any], resume: bool):
         """Continue the journal at `path` if `resume` is set and there is one; else start it with the first `add`.
 
         path: None keeps the views in memory alone.
-        fits: True for the place and the measurements of a view that the request asks for.
 
         Raises UsageError if it is of another request or another process writes it, FormatError if it is damaged, and
         OutputError if it cannot be written.
@@ -49,7 +41,7 @@ class Journal:
         if self.path is not None:
             self._request = json.loads(json.dumps(request, allow_nan=False))
             if resume and self.path.exists():
-                self._continue(self.path, fits)
+                self._continue(self.path)
 
     def __enter__(self) -> "Journal":
         return self
@@ -65,7 +57,8 @@ class Journal:
         if self.path is None:
             return
         with _named_errors(self.path):
-            lines = [{"view": view, "measurements": [asdict(m) for m in measurements]}]
+            line = {"view": view, "measurements": [asdict(m) for m in measurements]}
+            lines = [line | {HASH: digest_of_values(line)}]
             if self._stream is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._stream = self.path.open("ab")  # it is emptied only after it is locked
@@ -77,7 +70,7 @@ class Journal:
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
 
-    def _continue(self, path: Path, fits: Fits) -> None:
+    def _continue(self, path: Path) -> None:
         """Read the finished views, and keep the file open where it is of this request."""
         with _named_errors(path), ExitStack() as stack:
             stream = stack.enter_context(path.open("r+b"))
@@ -97,13 +90,10 @@ class Journal:
             before = first.get("request") if isinstance(first, dict) else None
             check_request(path, before if isinstance(before, dict) else {}, now, ANEW)
             for number, line in enumerate(lines[1:], start=2):
-                try:
-                    view, measurements = line["view"], tuple(map(_measurement, line["measurements"]))
-                    if type(view) is not int or view in self.views or not fits(view, measurements):
-                        raise ValueError(line)
-                except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-                    raise FormatError(path, f"its line {number} is damaged; {ANEW}") from error
-                self.views[view] = measurements
+                whole = isinstance(line, dict) and line.pop(HASH, None) == digest_of_values(line)
+                if not whole or line["view"] in self.views:
+                    raise FormatError(path, f"its line {number} is damaged; {ANEW}")
+                self.views[line["view"]] = tuple(Measurement(**each) for each in line["measurements"])
             stack.pop_all()  # the stream stays open
             self._stream = stream
 
@@ -123,16 +113,6 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]
             yield from (f"{key}.{inner}" for inner in _changes(old, new))
         elif old != new:
             yield key
-
-
-def _measurement(line: Any) -> Measurement:
-    """A measurement as it was written; raises TypeError or KeyError if it is none."""
-    texts, numbers = (line["recipe"], line["view"], line["note"]), (line["scale"], line["samples"], line["seconds"])
-    defined = [n for n in (line["evaluations"], *line["values"].values()) if n is not None]
-    finite = all(type(n) in (int, float) and math.isfinite(n) for n in (*numbers, *defined))
-    if not finite or not all(isinstance(text, str) for text in texts):
-        raise TypeError(line)
-    return Measurement(**line)
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:

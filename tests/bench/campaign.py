@@ -19,12 +19,13 @@ import numpy as np
 import torch
 
 import aaplug.verbs.evaluate  # noqa: F401  (imports the verbs before the children are forked)
-from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.journal import HASH, Journal
 from aaplug.finetuning.state import begin, load, save
 from aaplug.io.batch_file import read_batch
 from aaplug.io.cameras import CAMERA_FORMATS, read_camera_path, read_cameras
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.scenes import SCENE_FORMATS, WritableFormat, sog, write_scene
+from aaplug.system.digests import digest_of_values
 from tests.bench import heading, row
 from tests.conftest import make_scene
 from tests.hostile import NAMES, Target, check, mutations, read_as_info_does, scene
@@ -47,7 +48,10 @@ IMAGES = {
     "BMP": (".bmp", np.uint8, 3),
 }
 EXR = b"\x76\x2f\x31\x01\x02\x00\x00\x00channels\0chlist\0" + bytes(200)  # the start of one, which is refused
-JOURNAL = json.dumps({"request": {"views": 1}}) + "\n" + json.dumps({"view": 0, "measurements": []}) + "\n"
+VIEW = {"view": 0, "measurements": []}
+JOURNAL = "".join(
+    json.dumps(each) + "\n" for each in ({"request": {"views": 1}}, VIEW | {HASH: digest_of_values(VIEW)})
+)
 
 
 def main(mutations: int = 100_000, seed: int = 0, only: str = "") -> None:
