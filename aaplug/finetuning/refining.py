@@ -26,9 +26,8 @@ from aaplug.io.rad import node_sizes, shown_of
 from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import Viewer
-from aaplug.options.verbs import LEVEL_STEPS
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.monitor import SILENT, Monitor
+from aaplug.system.monitor import Monitor
 
 MAX_POSES = 100  # training poses
 VIEWS_BETWEEN = 2  # views between two poses, which are drawn like training's
@@ -52,15 +51,15 @@ def refine(
     rate: float,
     look: Renderer,
     poses: Sequence[Camera],
-    steps: int = LEVEL_STEPS,
-    viewer: Viewer | None = None,
-    monitor: Monitor = SILENT,
-    smaller: Sequence[float] = (),
+    steps: int,
+    viewer: Viewer | None,
+    monitor: Monitor,
+    smaller: Sequence[float],
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
     rate: the lowest sampling rate relative to training's that it is meant for.
-    steps: for a rate of `USUAL_STEPS_RATE` and above; see `LEVEL_STEPS`.
+    steps: for a rate of `USUAL_STEPS_RATE` and above.
     look: draws the scene as training showed it.
     poses: views to tune on, at the training size.
     viewer: what will draw the result; None for aaplug.
@@ -98,7 +97,7 @@ def refine_tree(
     poses: Sequence[Camera],
     steps: int,
     viewer: Viewer,
-    monitor: Monitor = SILENT,
+    monitor: Monitor,
 ) -> Gaussians:
     """A tree after tuning: each step draws what Spark draws of it at one of the rates; as it is where that is no help.
 
@@ -136,11 +135,6 @@ def refine_tree(
 
 def _tuned(job: TuningJob, monitor: Monitor) -> Gaussians:
     """The scene of a job after all of its steps."""
-    with torch.no_grad(), monitor.progress("rendering", "views") as tell:
-        for number, view in enumerate(job.views):
-            tell(number, len(job.views))
-            for scale in job.settings.weights:
-                job.truth(view, scale)
     state, steps = begin(job), job.settings.steps
     with monitor.progress("refining", "steps") as tell:
 
