@@ -34,6 +34,7 @@ MODES = {
     "rasterize_mode": ("classic", "antialiased", "matched"),
     "trained_mode": ("classic", "antialiased"),
     "camera_model": tuple(LENSES),
+    "depth_mode": ("expected", "median"),
 }
 
 FIXED: dict[str, object] = {  # arguments of gsplat 1.5 and 1.6 of which only the default, or its like, is supported
@@ -96,6 +97,7 @@ class Options:
     max_alpha: float
     global_z_order: bool = True
     camera_model: str = "pinhole"
+    depth_mode: str = "expected"
 
     def __post_init__(self) -> None:
         for name, modes in MODES.items():

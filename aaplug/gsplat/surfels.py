@@ -22,9 +22,6 @@ from aaplug.rasterizers.choice import kernels_of
 from aaplug.rendering.passes import composited
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
-from aaplug.system.errors import UsageError, not_one_of
-
-DEPTH_MODES = ("expected", "median")
 
 
 @contract
@@ -78,12 +75,11 @@ def rasterization_2dgs(
     Raises:
         UsageError: as `rasterization`; also, there is no such `depth_mode`.
     """
-    if depth_mode not in DEPTH_MODES:
-        raise UsageError("depth_mode", not_one_of(depth_mode, DEPTH_MODES))
     refuse({"sparse_grad": sparse_grad, "absgrad": absgrad, **others})
     options = Options(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size or 16, render_mode),
         *("classic", "classic", max_alpha),
+        depth_mode=depth_mode,
     )
     views = views_of(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, None, None, options)
     painter = rasterizer_of(rasterizer, means.dtype, means.device.type) if isinstance(rasterizer, str) else rasterizer
