@@ -440,7 +440,7 @@ def test_threads_may_use_a_name_for_the_first_time_at_once(monkeypatch):
         together.wait(timeout=10)
         return psnr
 
-    monkeypatch.setattr("aaplug.system.registry._at", found)
+    monkeypatch.setattr("aaplug.system.registry.resolve_name", found)
     registry = Registry[Any]("metric", "aaplug.evaluation:Metric", {"PSNR": "there:PSNR"})
     monkeypatch.setattr(Registry, "type", Metric)
     with ThreadPoolExecutor(3) as threads:

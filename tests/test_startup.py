@@ -15,7 +15,7 @@ from aaplug.methods import RECIPES
 from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
-from aaplug.system.registry import REGISTRIES, _at, names_of
+from aaplug.system.registry import REGISTRIES, names_of, registry_of
 from tests.conftest import run_python
 from tests.test_options import REFUSED
 
@@ -84,7 +84,7 @@ def test_the_program_starts_quickly(monkeypatch):
 
 @pytest.mark.parametrize("kind", REGISTRIES)
 def test_names_are_known_before_what_they_name(kind):
-    assert names_of(kind) == list(_at(REGISTRIES[kind]))
+    assert names_of(kind) == list(registry_of(kind))
 
 
 def test_other_names_agree_with_what_they_name():

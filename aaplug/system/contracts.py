@@ -17,6 +17,7 @@ from dataclasses import dataclass, fields
 from functools import cache, wraps
 from importlib import import_module
 from numbers import Integral, Real
+from pkgutil import resolve_name
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -63,8 +64,7 @@ class LazyType:
     def __contains__(self, value: Any) -> bool:
         if value is None or isinstance(value, type | str):  # no reason to import anything
             return False
-        module, _, name = self.place.partition(":")
-        return isinstance(value, getattr(import_module(module), name))
+        return isinstance(value, resolve_name(self.place))
 
     def __str__(self) -> str:
         return self.place.partition(":")[2]

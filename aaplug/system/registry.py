@@ -9,9 +9,9 @@ names can be listed without importing anything.
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from pkgutil import resolve_name
 from threading import get_ident
 from typing import Any, TypeVar
 
@@ -70,7 +70,7 @@ class Registry(Mapping[str, T]):
     @property
     def type(self) -> Any:
         """The type of the entries."""
-        return _at(self._type_at)
+        return resolve_name(self._type_at)
 
     def __getitem__(self, name: Any) -> T:
         if not isinstance(name, str):
@@ -80,7 +80,7 @@ class Registry(Mapping[str, T]):
                 self._load_plug_ins()
             else:
                 value: Any = self._built_in[name]
-                self._add(name, _at(value) if isinstance(value, str) else value, f"{self.kind} {name}")
+                self._add(name, resolve_name(value) if isinstance(value, str) else value, f"{self.kind} {name}")
         if name not in self._entries:
             raise NoEntryError(self.kind, not_one_of(name, self, "; if a package adds it, is that installed?"))
         return self._entries[name]
@@ -103,7 +103,7 @@ class Registry(Mapping[str, T]):
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         """A registry is its process's own; a copy is that of the process that makes it."""
-        return _at, (REGISTRIES[self.kind],)
+        return resolve_name, (REGISTRIES[self.kind],)
 
     def name_of(self, value: object) -> str | None:
         """The name of an entry that is in use; None if there is no such entry."""
@@ -218,18 +218,12 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
 
 def registry_of(kind: str) -> Any:  # a run-time check of a registry would load its entries
     """The registry of a kind."""
-    return _at(REGISTRIES[kind])
+    return resolve_name(REGISTRIES[kind])
 
 
 def group_of(kind: str) -> str:
     """Name of the entry point group of a kind."""
     return f"{PREFIX}{kind.replace(' ', '_')}{'es' if kind.endswith('s') else 's'}"
-
-
-def _at(place: str) -> Any:
-    """The object at "module:name"."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
 
 
 @cache
