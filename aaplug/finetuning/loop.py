@@ -23,6 +23,7 @@ from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import PlugInError, UsageError
+from aaplug.system.monitor import Tell
 from aaplug.system.plug_ins import asked, blaming
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
@@ -38,18 +39,21 @@ def run(
     *,
     every: int = 100,
     keep: Callable[[State], None] = lambda state: None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], object] = lambda: False,
+    tell: Tell = lambda done, total: None,
 ) -> bool:
     """Step until the job is done or `stop()` is true; return True if it is done.
 
     state: where to begin; changed in place.
     every: steps between calls of `keep`, which is also called when the run stops.
-    stop: asked before every step.
+    stop: asked before every step.  tell: called with (steps done, steps in all).
 
     Raises UsageError if many steps in turn have no finite gradient, or the loss breaks its interface.
     """
+    tell(state.step, job.settings.steps)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
+        tell(state.step, job.settings.steps)
         _average(job.settings, state)
         if state.bad_steps >= MAX_BAD_STEPS:
             problem = f"has no finite gradient at step {state.step}, nor at the {MAX_BAD_STEPS - 1} before"

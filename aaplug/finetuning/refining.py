@@ -135,14 +135,9 @@ def refine_tree(
 
 def _tuned(job: TuningJob, monitor: Monitor) -> Gaussians:
     """The scene of a job after all of its steps."""
-    state, steps = begin(job), job.settings.steps
+    state = begin(job)
     with monitor.progress("refining", "steps") as tell:
-
-        def stop() -> bool:
-            tell(state.step, steps)
-            return False
-
-        run(job, state, every=steps, stop=stop)
+        run(job, state, every=job.settings.steps, tell=tell)
     return state.scene(job)
 
 

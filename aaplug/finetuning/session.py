@@ -59,14 +59,7 @@ def tune(
         monitor.say(f"step {state.step} of {steps}{loss}: {decibels}; {pace:.2f} s per step")
 
     with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as presses:
-
-        def stop() -> bool:
-            tell(state.step, steps)
-            return bool(presses)
-
-        done = run(job, state, every=every, keep=keep, stop=stop)
-        if done:
-            tell(steps, steps)
+        done = run(job, state, every=every, keep=keep, stop=lambda: presses, tell=tell)
     if not done:
         monitor.say(f"stopped at step {state.step}")
         raise KeyboardInterrupt
