@@ -20,7 +20,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.images import image_size, read_image
 from aaplug.io.scenes import SceneLike, read_scene, scene_of, write_scene
 from aaplug.levels.clusters import rates_of
-from aaplug.levels.merging import Goal, merge_in_chunks
+from aaplug.levels.merging import Goal, merge
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.options.base import Options
 from aaplug.options.shared import DEFAULT_FOV, Orbit
@@ -193,7 +193,7 @@ def test_how_much_a_picture_of_a_pyramid_hangs_on_the_rate():
     scene = make_scene(300)
     chunks = chunks_of(scene.means, 100)
     cameras = around(scene, Orbit(train_view="96x64"))
-    coarse = merge_in_chunks(scene, rates_of(scene, cameras.train), chunks, Goal(0.5, tolerance=1e3))
+    coarse = merge(scene, rates_of(scene, cameras.train), Goal(0.5, tolerance=1e3), chunks=chunks)
     pyramid = Pyramid.of([scene, coarse.scene], [chunks, coarse.chunks])
     shown = Renderer.of(pyramid, cameras, "auto", quality="fast", rasterizer="eager")
     view = replace(cameras.test[0], trained_focal=None)

@@ -22,7 +22,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.levels import pairing
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, pair_moments, rates_of
 from aaplug.levels.covariances import area, areas, blur, covariances, overlaps
-from aaplug.levels.merging import TOLERANCE, Goal, merge, merge_in_chunks
+from aaplug.levels.merging import TOLERANCE, Goal, merge
 from aaplug.levels.pairing import ALPHA_WEIGHT, MAX_COST, PIXEL_BLUR, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
@@ -49,7 +49,7 @@ def level_goal(level: int) -> Goal:
 
 
 def merged_to(count: int, scene: Gaussians, rate: float = RATE) -> Gaussians:
-    return merge(scene, torch.full((len(scene),), rate), Goal(min(1.0, math.sqrt(count / len(scene))), count))
+    return merge(scene, torch.full((len(scene),), rate), Goal(min(1.0, math.sqrt(count / len(scene))), count)).scene
 
 
 def test_a_merged_pair_alone_keeps_the_integral_of_its_alpha():
@@ -165,7 +165,7 @@ def test_batches_of_chunks_may_be_merged_by_several_threads(monkeypatch):
     def merged(threads: int):
         with torch_threads(threads):
             rates = torch.full((700,), RATE)
-            return merge_in_chunks(scene, rates, chunks, goal, lambda *done: told.append((done, get_ident())))
+            return merge(scene, rates, goal, lambda *done: told.append((done, get_ident())), chunks=chunks)
 
     one, three = merged(1), merged(3)
     assert len(one.scene) < 600
@@ -187,7 +187,7 @@ def test_what_is_large_stays_and_what_is_small_is_merged():
     small.means[:] = 0.02 * small.means + 3
     small.log_scales[:] = math.log(0.002)
     scene = Gaussians(*(torch.cat([getattr(s, n) for s in (large, small)]) for n in large.columns))
-    found = merge(scene, torch.full((450,), RATE), level_goal(1))
+    found = merge(scene, torch.full((450,), RATE), level_goal(1)).scene
     near = found.means.min(dim=1).values > 2
     assert int((~near).sum()) > 45
     assert int(near.sum()) < 40
@@ -198,7 +198,7 @@ def test_what_falls_below_a_size_is_merged_whatever_it_changes():
     scene = replace(make_scene(4), means=near, log_scales=torch.full((4, 3), math.log(0.01)))
     goals = [Goal(0.5, tolerance=1e-12, smallest=px) for px in (0.0, 0.5, 100.0)]
     everywhere, one = torch.full((4,), RATE), torch.zeros(4, dtype=torch.int64)
-    counts = [len(merge_in_chunks(scene, everywhere, one, goal)[0]) for goal in goals]
+    counts = [len(merge(scene, everywhere, goal, chunks=one)[0]) for goal in goals]
     assert counts == [4, 3, 1]
 
 
@@ -206,7 +206,7 @@ def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
     rates = rates_of(sample_scene, sample_cameras.train)
     view = sample_cameras.test[0]
     truth = Renderer.of(sample_scene, sample_cameras, quality="best", background="white")(view.scaled(1 / 8)).rgb
-    level = merge(sample_scene, rates, level_goal(3))
+    level = merge(sample_scene, rates, level_goal(3)).scene
     assert len(level) < 0.5 * len(sample_scene)
     image = Renderer.of(level, sample_cameras, background="white")(view.scaled(1 / 8)).rgb
     assert (psnr(image, truth) or 0) > 38
@@ -219,14 +219,14 @@ def test_thin_things_keep_their_contrast(level, least, blind, monkeypatch):
     """Wires 0.5 to 4 px wide close to a board; merging to the same count by distance alone loses them."""
     scene, cameras = wires_over_checkerboard()
     look, rates = Renderer.of(scene, cameras, "matched"), rates_of(scene, cameras.train)
-    found = merge(scene, rates, level_goal(level))
+    found = merge(scene, rates, level_goal(level)).scene
     assert least < contrast(look.showing(found), look, cameras.test, 2**level) < 1.1
 
     def distances(clusters, one, other, rate, most):
         return (clusters.means[other] - clusters.means[one]).square().sum(dim=1).float()
 
     monkeypatch.setattr(pairing, "costs", distances)
-    nearest = merge(scene, rates, Goal(0.5**level, len(found)))
+    nearest = merge(scene, rates, Goal(0.5**level, len(found))).scene
     assert contrast(look.showing(nearest), look, cameras.test, 2**level) < blind
 
 
@@ -318,7 +318,8 @@ def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(t
     plane = rotation_matrices(pair.unit_quats)[0]
     pair = replace(pair, means=plane[:, 0] * torch.tensor([[-0.02], [0.02]]))
     solid = replace(pair, flat=False)
-    one, other = (merge(scene, torch.full((2,), 50.0), Goal(math.sqrt(1 / len(scene)), 1)) for scene in (pair, solid))
+    goal = Goal(math.sqrt(1 / 2), 1)
+    one, other = (merge(scene, torch.full((2,), 50.0), goal).scene for scene in (pair, solid))
     scales = one.log_scales[0]
     assert one.flat
     assert scales[2] == -30

@@ -28,7 +28,7 @@ from aaplug.finetuning import refining
 from aaplug.io.rad import node_sizes, shown_of
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.pyramid_folder import MANIFEST, read_manifest, read_pyramid
-from aaplug.levels.merging import Goal, merge_in_chunks
+from aaplug.levels.merging import Goal, merge
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
@@ -51,9 +51,8 @@ def pyramid(n: int = 300, levels: int = 3, largest: int = 40) -> Pyramid:
     """Merged without tuning."""
     scenes, chunks = [make_scene(n)], [chunks_of(make_scene(n).means, largest)]
     for level in range(1, levels + 1):
-        scene, _, places, _ = merge_in_chunks(
-            scenes[-1], rates(scenes[-1]), chunks[-1], Goal(0.5**level, tolerance=1e-2)
-        )
+        goal = Goal(0.5**level, tolerance=1e-2)
+        scene, _, places, _ = merge(scenes[-1], rates(scenes[-1]), goal, chunks=chunks[-1])
         scenes.append(scene)
         chunks.append(places)
     return Pyramid.of(scenes, chunks)
@@ -88,7 +87,7 @@ def test_levels_become_lighter_and_stand_for_their_own_chunk_alone(levels):
     finest = levels.finest
     chunks = levels.chunks[: levels.sizes[0]]
     painted = replace(finest, sh=chunks.float()[:, None, None].expand_as(finest.sh).clone())
-    coarse, _, places, _ = merge_in_chunks(painted, rates(painted), chunks, Goal(0.25, tolerance=1e3))
+    coarse, _, places, _ = merge(painted, rates(painted), Goal(0.25, tolerance=1e3), chunks=chunks)
     assert len(coarse) < len(finest) / 3
     assert torch.allclose(coarse.sh[:, 0, 0], places.float(), atol=1e-3)
 
@@ -171,7 +170,7 @@ def test_a_near_part_is_fine_and_a_far_part_coarse():
     far.means[:] = 0.1 * far.means + torch.tensor([0.0, 40.0, 0.0])
     both = Gaussians(**{name: torch.cat([getattr(near, name), getattr(far, name)]) for name in near.columns})
     chunks = torch.arange(2).repeat_interleave(60)
-    coarse, _, places, _ = merge_in_chunks(both, rates(both), chunks, Goal(0.25, tolerance=1e3))
+    coarse, _, places, _ = merge(both, rates(both), Goal(0.25, tolerance=1e3), chunks=chunks)
     whole = Pyramid.of([both, coarse, coarse], [chunks, places, places])
     view = make_camera((0.0, -4.0, 0.0), (640, 480))
     cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [view]))

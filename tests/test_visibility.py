@@ -103,15 +103,16 @@ def test_a_level_leaves_out_what_is_hidden_and_keeps_it_where_nothing_is_known()
     scene, rates = make_scene(40), torch.full((40,), RATE)
     hidden = torch.arange(40) % 2 == 0
     goal = Goal(1.0, tolerance=0.0)
-    assert len(merge(scene, rates, goal)) == 40
-    left = merge(scene, rates, goal, visible=(~hidden).float())
+    assert len(merge(scene, rates, goal).scene) == 40
+    left = merge(scene, rates, goal, visible=(~hidden).float()).scene
     assert torch.equal(left.means.sort(dim=0).values, scene.means[~hidden].sort(dim=0).values)
 
 
 def test_equally_visible_gaussians_merge_alike_for_a_tolerance_of_their_squared_share():
     scene, rates, share = make_scene(60), torch.full((60,), RATE), 0.4
     found = [
-        merge(scene, rates, Goal(0.1, tolerance=0.3 * own**2), visible=torch.full((60,), own)) for own in (1.0, share)
+        merge(scene, rates, Goal(0.1, tolerance=0.3 * own**2), visible=torch.full((60,), own)).scene
+        for own in (1.0, share)
     ]
     assert len(found[0]) < 50
     for name, column in found[0].columns.items():

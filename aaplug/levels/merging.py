@@ -69,30 +69,22 @@ def merge(
     goal: Goal,
     tell: Tell = lambda done, total: None,
     visible: Float[Tensor, " n"] | None = None,
-) -> Gaussians:
+    chunks: Int[Tensor, " n"] | None = None,
+) -> Level:
     """A lighter scene, with a record of it; the scene itself if nothing is to be merged.
+
+    2D Gaussians stay flat: discs across the thinnest axes of the covariances that they are merged to.
 
     rates: training's sampling rate of each Gaussian, px per world unit; see `rates_of`.
     visible: share of each Gaussian that views show, see `visibility`; None where nothing is known of any.
+    chunks: the chunk of each, None for one of all.  No Gaussian of the lighter scene stands for those of different
+        chunks; its Gaussians lie by ascending chunk.
     """
-    if len(scene) <= (goal.count or 1):
-        return scene
-    return merge_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible).scene
-
-
-def merge_in_chunks(
-    scene: Gaussians,
-    rates: Float[Tensor, " n"],
-    chunks: Int[Tensor, " n"],
-    goal: Goal,
-    tell: Tell = lambda done, total: None,
-    visible: Float[Tensor, " n"] | None = None,
-) -> Level:
-    """A lighter scene, its Gaussians by ascending chunk; see `merge`.
-
-    No Gaussian of it stands for those of different chunks.  2D Gaussians stay flat: discs across the thinnest axes of
-    the covariances that they are merged to.
-    """
+    if chunks is None:
+        if len(scene) <= (goal.count or 1):
+            return Level(scene, goal.rate)
+        one = torch.zeros(len(scene), dtype=torch.int64)
+        return merge(scene, rates, goal, tell, visible, one)._replace(chunks=None, parents=None)
     scene = fuse_stored(scene)
     if visible is None:
         visible = torch.full((len(scene),), torch.nan)

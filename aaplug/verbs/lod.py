@@ -32,7 +32,7 @@ from aaplug.io.scenes.pyramid_folder import MANIFEST
 from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import STREAMS, Front
 from aaplug.levels.clusters import rates_of
-from aaplug.levels.merging import TOLERANCE, Goal, merge, merge_in_chunks
+from aaplug.levels.merging import TOLERANCE, Goal, merge
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
@@ -150,10 +150,7 @@ class _Maker:
             with monitor.progress("looking", "views") as tell:
                 visible = visibility(look, self.views, scale, tell)
         with monitor.progress("merging", "Gaussians") as tell:
-            if before.chunks is None:
-                level = Level(merge(scene, rates, goal, tell, visible), goal.rate)
-            else:
-                level = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
+            level = merge(scene, rates, goal, tell, visible, before.chunks)
         monitor.say(f"{counted(len(level.scene), 'Gaussian')} for {goal.rate:.3g} × the training rate")
         return self._tuned(level) if self.viewer is None else level
 
