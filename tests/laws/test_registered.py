@@ -3,6 +3,7 @@
 import math
 import secrets
 from dataclasses import replace
+from inspect import isfunction, signature
 from itertools import chain
 from operator import attrgetter
 
@@ -14,7 +15,7 @@ from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import Fusion
 from aaplug.core.rules import RULES_3DGS
 from aaplug.evaluation import METRICS
-from aaplug.evaluation.laws import LAWS
+from aaplug.evaluation.laws import LAWS, drawing, files, filters, recipes
 from aaplug.evaluation.laws.drawing import (
     alpha_is_exact,
     draws_what_the_reference_draws,
@@ -152,6 +153,13 @@ BROKEN = {
     "opaque_when_near": promising("mip-splatting"),
     "equals_training": promising("mip"),
 }
+
+
+def test_every_law_stands_in_the_table():
+    modules = (drawing, files, filters, recipes)
+    functions = filter(isfunction, chain(*(vars(module).values() for module in modules)))
+    laws = {f for f in functions if len(signature(f).parameters) == 1 and signature(f).return_annotation is None}
+    assert laws == {*chain(*LAWS.values())}
 
 
 @pytest.mark.parametrize("law", [*chain(*LAWS.values())], ids=attrgetter("__name__"))

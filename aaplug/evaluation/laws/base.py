@@ -1,10 +1,10 @@
-"""The table of laws, and scenes, cameras and splats at random to try them on."""
+"""Scenes, cameras and splats at random to try laws on."""
 
 import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,19 +15,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.splats import Splats2D
 
 F64 = torch.float64
-LAWS: dict[str, list[Callable[[Any], None]]] = {}  # by kind
-L = TypeVar("L", bound=Callable[[Any], None])
 T = TypeVar("T", Splats2D, Gaussians)
-
-
-def law_of(kind: str) -> Callable[[L], L]:
-    """Enter a function into the table; the first line of its docstring is the law."""
-
-    def enter(law: L) -> L:
-        LAWS.setdefault(kind, []).append(law)
-        return law
-
-    return enter
 
 
 def require(holds: object, problem: str) -> None:

@@ -21,7 +21,7 @@ from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.forward import STEP
 from aaplug.system.plug_ins import check_answer
 
-from .base import F64, copies_of, law_of, make_splats, require, require_same
+from .base import F64, copies_of, make_splats, require, require_same
 
 HW = (33, 44)  # px
 BLACK, SKY = (0.0, 0.0, 0.0), (0.25, 0.5, 1.0)
@@ -45,7 +45,6 @@ def some_splats(m: int, hw: tuple[int, int], log_sigmas: tuple[float, float], wi
     return replace(splats, dets=xx * yy - xy * xy, depth_slopes=slopes, window=window)
 
 
-@law_of("pixel kernel")
 def alpha_is_exact(pixel: PixelKernel) -> None:
     """`alpha` from raster rows is `exact` to 1e-9 in float64 and 2e-5 in float32."""
     for rules, window, dtype, compiling in product((RULES_3DGS, COARSE), WINDOWS, (torch.float32, F64), (False, True)):
@@ -82,7 +81,6 @@ def _pixels(
     return Pixels(corners, x, y)
 
 
-@law_of("pixel kernel")
 def rows_hold_colours(pixel: PixelKernel) -> None:
     """A raster row has `columns` numbers with the colour, the padding row draws nothing, and a pass is whole steps."""
     splats = some_splats(9, (TILE, TILE), (-1.5, 2.5))
@@ -113,14 +111,12 @@ def require_bounds(pixel: PixelKernel, splats: Splats2D, rules: Rules) -> None:
     require(not (drawn & ~inside).any(), "a pixel is drawn outside of its splat's ellipse")
 
 
-@law_of("pixel kernel")
 def ellipses_bound_it(pixel: PixelKernel) -> None:
     """`bounding_ellipses` contain every pixel that is drawn."""
     for rules in (RULES_3DGS, COARSE):
         require_bounds(pixel, some_splats(100, (48, 64), (-1.5, 2.5)), rules)
 
 
-@law_of("pixel kernel")
 def draws_the_exact_image(pixel: PixelKernel) -> None:
     """The tiled rasterizer draws its exact image, and differentiates it."""
     for window in (0.0, 1.0):
@@ -148,7 +144,6 @@ def require_same_image(image: Render, exact: Render) -> None:
     require(difference.max() < 0.01, f"differs by {difference.max():.1e} at a pixel")
 
 
-@law_of("compositor")
 def composites_the_exact_image(compositor: Compositor) -> None:
     """`tiles` composites what `exact` does."""
     for window, dtype in product(WINDOWS, (torch.float32, F64)):
@@ -159,7 +154,6 @@ def composites_the_exact_image(compositor: Compositor) -> None:
         require_same_image(tiled, exact)
 
 
-@law_of("rasterizer")
 def draws_what_the_reference_draws(rasterizer: Rasterizer) -> None:
     """Images of any size are the reference's, whatever the rules, order and sizes, and ray slopes if it sorts tiles."""
     sizes, sigmas = ((33, 44), (1, 1), (17, 3)), ((-2.0, 0.0), (0.0, 4.0))
@@ -176,7 +170,6 @@ def draws_what_the_reference_draws(rasterizer: Rasterizer) -> None:
         require((image.alpha.double() - exact.alpha).abs().median() < SAME, "alpha differs")
 
 
-@law_of("rasterizer")
 def keeps_its_splats(rasterizer: Rasterizer) -> None:
     """It keeps its input, gives the same bits again, and draws the background alone without splats."""
     splats = make_splats(300, (60, 70), seed=3)

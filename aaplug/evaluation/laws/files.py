@@ -16,7 +16,7 @@ from aaplug.io.scenes.rows import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.locks import OUR_PREFIX
 
-from .base import copies_of, law_of, make_scene, require, require_same
+from .base import copies_of, make_scene, require, require_same
 
 COUNT = 20  # Gaussians
 HEADS = (b"", b"\0" * 64, b"\xff" * 64, b"ply\n" + b"comment " * 8, b"PK\3\4" + bytes(60), b"{" * 64)
@@ -27,7 +27,6 @@ def _images() -> list[Tensor]:
     return [*torch.rand(2, 64, 64, 3, generator=torch.Generator().manual_seed(0))]
 
 
-@law_of("metric")
 def is_ideal_for_the_truth(metric: Metric) -> None:
     """`measure` gives `ideal` or None for the truth, a worse value for noise, the same again, and keeps both images."""
     if metric.measure is None:
@@ -47,7 +46,6 @@ def is_ideal_for_the_truth(metric: Metric) -> None:
     require(worse, f"noise has {value}, which is no worse than {ideal}")
 
 
-@law_of("loss")
 def is_least_for_the_truth(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     """It is 0 for the truth itself, above 0 for noise, and keeps both images."""
     image, truth = _images()
@@ -58,7 +56,6 @@ def is_least_for_the_truth(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     require(kept, "changes an image")
 
 
-@law_of("loss")
 def has_gradients_of_images(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     """Its gradient tells how fast it rises away from the truth, and is finite for the truth itself."""
     image, truth = _images()
@@ -72,7 +69,6 @@ def has_gradients_of_images(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     require(same.isfinite().all(), "the gradient is NaN or infinite for the truth itself")
 
 
-@law_of("scene format")
 def tells_scenes_apart(format: SceneFormat) -> None:
     """`sniff` never raises, and `open_scene` refuses an empty or foreign file with FormatError, if `sniff` takes it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +84,6 @@ def tells_scenes_apart(format: SceneFormat) -> None:
                 pass
 
 
-@law_of("scene format")
 def reads_what_it_writes(format: SceneFormat) -> None:
     """It reads what it writes and keeps it, with as many Gaussians, at their places to 1 %, in any order."""
     if not isinstance(format, WritableFormat):
@@ -114,7 +109,6 @@ def reads_what_it_writes(format: SceneFormat) -> None:
         require(len(opened.load(5, 9)) == 4, "`load` does not return the rows from start up to stop")
 
 
-@law_of("scene format")
 def writes_the_same_files_again(format: SceneFormat) -> None:
     """The same scene gives the same names and bytes, and no other file is left beside them."""
     if not isinstance(format, WritableFormat):
@@ -129,7 +123,6 @@ def writes_the_same_files_again(format: SceneFormat) -> None:
     require(files[0] == files[1], "writes other names or bytes the second time")
 
 
-@law_of("camera format")
 def tells_cameras_apart(format: CameraFormat) -> None:
     """`sniff` never raises: for a missing path, an empty folder, or a file of bytes."""
     with tempfile.TemporaryDirectory() as folder:

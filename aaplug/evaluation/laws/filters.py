@@ -19,7 +19,7 @@ from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.system.plug_ins import check_answer
 
-from .base import F64, copies_of, law_of, make_camera, make_scene, make_splats, require, require_gradients, require_same
+from .base import F64, copies_of, make_camera, make_scene, make_splats, require, require_gradients, require_same
 
 N = 40  # Gaussians
 EYES = [(0.0, -4.0, 0.0), (3.0, -4.0, 1.0), (-2.0, -6.0, 0.5)]
@@ -66,7 +66,6 @@ def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.
     )
 
 
-@law_of("screen filter")
 def keeps_splats(screen: ScreenFilter) -> None:
     """It keeps its input, and returns splats with other covariances and opacities alone, the same again."""
     for view, training in SITUATIONS.values():
@@ -80,7 +79,6 @@ def keeps_splats(screen: ScreenFilter) -> None:
         require_same(screen(splats, view, training), copies_of(filtered), "gives, called again, another")
 
 
-@law_of("screen filter")
 def never_shrinks_splats(screen: ScreenFilter) -> None:
     """Covariances never shrink, and stored determinants are theirs."""
     for view, training in SITUATIONS.values():
@@ -93,7 +91,6 @@ def never_shrinks_splats(screen: ScreenFilter) -> None:
         torch.testing.assert_close(filtered.dets, xx * yy - xy * xy, rtol=1e-7, atol=1e-12)
 
 
-@law_of("screen filter")
 def keeps_opacities_in_range(screen: ScreenFilter) -> None:
     """Opacities stay in [0, 1], an opacity of 0 stays 0; at any scale values are finite and keep their precision."""
     for (view, training), sigma, dtype in product(
@@ -109,7 +106,6 @@ def keeps_opacities_in_range(screen: ScreenFilter) -> None:
         require(finite, f"{name} give values that are not finite")
 
 
-@law_of("screen filter")
 def keeps_huge_splats(screen: ScreenFilter) -> None:
     """A splat much larger than a pixel keeps its opacity and shape."""
     for view, training in SITUATIONS.values():
@@ -120,7 +116,6 @@ def keeps_huge_splats(screen: ScreenFilter) -> None:
         torch.testing.assert_close(filtered.covs / scale, splats.covs / scale, rtol=1e-6, atol=1e-6)
 
 
-@law_of("screen filter")
 def has_gradients_on_screen(screen: ScreenFilter) -> None:
     """Its gradient is that of its formula."""
     splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
@@ -136,7 +131,6 @@ def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) 
     return replace(make_scene(N, dtype=dtype), filter_3d=filters, convention=convention)
 
 
-@law_of("world filter")
 def keeps_gaussians(world: WorldFilter) -> None:
     """It keeps its input, records itself in `fused`, and else changes scales and opacities alone, the same again."""
     scene = world_scene()
@@ -153,7 +147,6 @@ def keeps_gaussians(world: WorldFilter) -> None:
     require(twice.fused[0] == once.fused[0] and len(twice.fused) == 2, "drops earlier records from `fused`")
 
 
-@law_of("world filter")
 def filters_each_by_itself(world: WorldFilter) -> None:
     """It treats each Gaussian by itself."""
     scene = world_scene()
@@ -164,7 +157,6 @@ def filters_each_by_itself(world: WorldFilter) -> None:
     torch.testing.assert_close(part.logit_opacities, whole.logit_opacities)
 
 
-@law_of("world filter")
 def never_shrinks_gaussians(world: WorldFilter) -> None:
     """Scales never shrink and opacities stay inside (0, 1), finite at any scale and in every convention."""
     shapes = {"scales as usual": lambda scene: scene, **EXTREMES}
@@ -181,7 +173,6 @@ def never_shrinks_gaussians(world: WorldFilter) -> None:
         require((inside | kept).all() or name != "scales as usual", "opacities reach 0 or 1")
 
 
-@law_of("world filter")
 def has_gradients_in_the_world(world: WorldFilter) -> None:
     """Its gradient is that of its formula."""
     scene = world_scene()[torch.arange(2)]

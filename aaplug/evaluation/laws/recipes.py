@@ -16,7 +16,7 @@ from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
 
-from .base import law_of, make_camera, make_scene, require
+from .base import make_camera, make_scene, require
 from .filters import CAMERAS
 
 SIDE, APART = 168, 40  # px
@@ -95,28 +95,24 @@ def _training_images(recipe: Recipe) -> list[Tensor]:
     return [renderer(camera).rgb for camera in CAMERAS[:2]]
 
 
-@law_of("recipe")
 def keeps_energy(recipe: Recipe) -> None:
     """If it promises `keeps_energy`, a lone splat keeps its light at every size."""
     drift = light_drift(recipe) if recipe.promises.keeps_energy else {}
     require(all(abs(change) < CUTOFF_LOSS for change in drift.values()), f"its light changes by {drift}")
 
 
-@law_of("recipe")
 def fades_when_small(recipe: Recipe) -> None:
     """If it promises `keeps_energy` and `fades_when_small`, a lone splat fades out where it is very small."""
     promised = recipe.promises.keeps_energy and recipe.promises.fades_when_small
     require(not promised or alpha_from_afar(recipe) < 0.01, "a splat much smaller than a pixel does not fade out")
 
 
-@law_of("recipe")
 def opaque_when_near(recipe: Recipe) -> None:
     """If it promises `opaque_when_near`, a lone splat has its opacity where it is very large."""
     alpha = alpha_from_near(recipe) if recipe.promises.opaque_when_near else OPACITY
     require(abs(alpha - OPACITY) < 1e-3 * OPACITY, f"alpha at the centre is {alpha:.4f} instead of {OPACITY}")
 
 
-@law_of("recipe")
 def equals_training(recipe: Recipe) -> None:
     """If it promises `equals_training`, its image at the training size is training's."""
     difference = difference_to_training(recipe) if recipe.promises.equals_training else 0.0
