@@ -12,7 +12,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from errno import EADDRNOTAVAIL
@@ -158,13 +158,14 @@ class Server:
         async for said in connection:
             try:
                 if isinstance(said, bytes) and file is not None:
-                    if file.add(said):
-                        subject = await asyncio.to_thread(self._open_scene, file.path)
+                    if path := file.send(said):
+                        subject = await asyncio.to_thread(self._open_scene, path)
                         return await asyncio.to_thread(_shown, subject)
                     continue
                 request = parse(said, page.subject.recipes, len(page.subject.views))
                 if isinstance(request, OpenRequest):
-                    file = IncomingFile(folder, request, allowed=self._token is None)
+                    file = _incoming(folder, request, allowed=self._token is None)
+                    next(file)
                     await connection.send(message({"take": request.name}, []))
                 else:
                     page.receive(request)
@@ -179,25 +180,21 @@ def _shown(subject: Subject) -> tuple[Subject, str]:
     return subject, json.dumps(subject.about(), allow_nan=False)
 
 
-class IncomingFile:
-    """A scene file that a page sends in parts."""
-
-    def __init__(self, folder: Path, request: OpenRequest, allowed: bool):
-        if not allowed:
-            raise UsageError(request.name, "is opened by a server that listens on this machine alone")
-        if request.size > disk_usage(folder).free / 2:
-            raise UsageError(request.name, f"has {request.size:,} bytes, more than the temporary folder takes")
-        self.path, self._missing = folder / request.name, request.size
-        self.path.write_bytes(b"")
-
-    def add(self, part: bytes) -> bool:
-        """Append a part; True at the end."""
-        if len(part) > self._missing:
-            raise UsageError(self.path.name, "is longer than it was announced")
-        with self.path.open("ab") as stream:
+def _incoming(folder: Path, request: OpenRequest, allowed: bool) -> Generator[Path | None, bytes, None]:
+    """Write a scene file that a page sends in parts, which are sent to this generator; yields its path at the end."""
+    if not allowed:
+        raise UsageError(request.name, "is opened by a server that listens on this machine alone")
+    if request.size > disk_usage(folder).free / 2:
+        raise UsageError(request.name, f"has {request.size:,} bytes, more than the temporary folder takes")
+    path, missing = folder / request.name, request.size
+    with path.open("wb") as stream:
+        while missing:
+            part = yield None
+            if len(part) > missing:
+                raise UsageError(request.name, "is longer than it was announced")
             stream.write(part)
-        self._missing -= len(part)
-        return self._missing == 0
+            missing -= len(part)
+    yield path
 
 
 def _is_local(host: str) -> bool:
