@@ -8,17 +8,11 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, Gaussians, Scene, TrainingViews, cameras_around, read_scene, write_png, write_scene
 from aaplug.core.colours import WHITE
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.training import TrainingViews
-from aaplug.io.images import write_png
 from aaplug.io.photographs import read_photo
-from aaplug.io.scenes import read_scene, write_scene
-from aaplug.io.scenes.scene import Scene
 from aaplug.options.shared import Orbit, ViewOptions
 from aaplug.rendering.agreement import Agreement, agreement, contradictions, settled
-from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FrameError

@@ -5,13 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
-from aaplug.core.splats import Render
+from aaplug import CameraSet, Monitor, Orbit, Render, UsageError, bench, evaluate, render, video
 from aaplug.finetuning.settings import Settings
 from aaplug.io import limits
 from aaplug.io.limits import SAMPLE_BYTES
 from aaplug.methods.recipe import MAX_SAMPLES
-from aaplug.options.shared import Orbit
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering import job as jobs
 from aaplug.rendering.assumed import CROP_SAMPLES
@@ -19,13 +17,7 @@ from aaplug.rendering.cost import EAGER, GRADIENTS, cost_of
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Drawing, Renderer
 from aaplug.system import groups
-from aaplug.system.errors import UsageError
-from aaplug.system.monitor import Monitor
-from aaplug.verbs.bench import bench
-from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.finetune import _cost, finetune
-from aaplug.verbs.render import render
-from aaplug.verbs.video import video
 from tests.conftest import make_camera, make_scene
 
 

@@ -6,16 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
+from aaplug import RULES_3DGS, CameraSet, Renderer, UsageError, bench, lod, read_scene, write_scene
 from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
-from aaplug.core.rules import RULES_3DGS
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
-from aaplug.verbs.bench import bench
-from aaplug.verbs.lod import lod
 from tests.conftest import make_camera, make_scene
 
 STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.io.cameras import read_camera_path, read_cameras
-from aaplug.io.scenes import read_scene
+from aaplug import read_camera_path, read_cameras, read_scene
 from tests.conftest import ROOT, SAMPLE
 
 ADD_ON = ROOT / "examples" / "blender" / "aaplug_camera.py"

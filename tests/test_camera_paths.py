@@ -7,12 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug import CameraSet, FormatError, read_camera_path
 from aaplug.core import camera_paths as paths
-from aaplug.core.cameras import CameraSet
 from aaplug.core.lenses import PINHOLE, Lens
-from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import sniff
-from aaplug.system.errors import FormatError
 from tests.conftest import make_camera
 
 VIEW = make_camera((0.0, -4.0, 0.0))

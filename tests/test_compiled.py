@@ -23,12 +23,11 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import RECIPES, Renderer, TrainingViews, UsageError
 from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.projection import project
-from aaplug.core.training import TrainingViews
 from aaplug.gsplat.drawing import OnlyCompiled
-from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels import point
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY
@@ -37,8 +36,6 @@ from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages, sources
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from aaplug.system.executors import torch_threads
 from aaplug.system.locks import SCRATCH_PREFIX
 from tests.conftest import COMPILED, make_camera, make_scene, run_python, sized

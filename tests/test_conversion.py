@@ -6,21 +6,15 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import RECIPES, CameraSet, Renderer, Rules, TrainingViews, UsageError, read_scene, write_scene
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.projection import project
-from aaplug.core.rules import Rules
 from aaplug.core.sampling import median_rates
-from aaplug.core.training import TrainingViews
-from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods import RECIPES
 from aaplug.methods.conversion import FITTED_VARIANCE, FORMS, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import DISC_VIEWER, VIEWERS
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 

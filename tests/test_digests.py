@@ -6,10 +6,9 @@ from functools import partial
 import pytest
 import torch
 
+from aaplug import RECIPES, FormatError
 from aaplug.core.gaussians import digest_of_scene
-from aaplug.methods import RECIPES
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import FormatError
 from tests.conftest import make_scene, sized
 
 SCENE = sized(make_scene(5))

@@ -8,12 +8,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from aaplug import METRICS, PROTOCOLS, RASTERIZERS, RECIPES, TrainingViews, find_recipe, read_image, write_png
 from aaplug.core.cameras import Camera, Exposure, Undistortion
 from aaplug.core.colours import WHITE
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
-from aaplug.core.training import TrainingViews
-from aaplug.evaluation import METRICS, PROTOCOLS
 from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
@@ -31,11 +30,7 @@ from aaplug.evaluation.results import (
     tables,
 )
 from aaplug.evaluation.truth import Truth, ViewTruth, back_projected
-from aaplug.io.images import read_image, write_png
 from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING
-from aaplug.methods import RECIPES
-from aaplug.methods.presets import find_recipe
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera, make_scene, with_photographs

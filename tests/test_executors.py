@@ -23,14 +23,13 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import Monitor, Renderer
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rendering.renderer import Renderer
 from aaplug.system import groups
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, OutputError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, given_threads, save, torch_threads
-from aaplug.system.monitor import Monitor
 from tests.conftest import ROOT, SAMPLE, exit_code, files_of_at_most, make_camera, make_scene, run_python
 from tests.work import refuse_three
 

@@ -9,18 +9,15 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import Aperture, CameraSet, Exposure, Render, UsageError, read_camera_path
 from aaplug.core.camera_paths import toward
-from aaplug.core.cameras import Aperture, CameraSet, Exposure
 from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras, spread, spread_out
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
-from aaplug.core.splats import Render
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.cameras import read_camera_path
 from aaplug.options.shared import FilmOptions
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 from tests.test_camera_paths import document
 

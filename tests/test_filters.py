@@ -6,18 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug import RECIPES, Renderer, TrainingViews, UsageError
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.sights import sights
-from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import ADAPTIVE_VARIANCE, LEAST_SHARE, Adaptive, AnisotropicSmoothing
 from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
-from aaplug.methods import RECIPES
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D
 from aaplug.methods.presets import suited
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, make_splats, sized, splats_of
 
 F64 = torch.float64

@@ -8,13 +8,12 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity as ssim_of_skimage
 
-from aaplug.core.cameras import CameraSet
+from aaplug import RASTERIZERS, RECIPES, VIEWERS, CameraSet, FormatError, TrainingViews, UsageError, finetune, write_png
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.imaging import quantised
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import sampling_bounds
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import LOSSES, loop
@@ -22,20 +21,14 @@ from aaplug.finetuning.fitting import fit
 from aaplug.finetuning.loop import advance, extent, least_log_scales, loss_at, run
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, RATES, Settings, balance, l2, slowed
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, between, leaves_of, load, save, scene_of
-from aaplug.io.images import write_png
 from aaplug.lab import mipmap_gs
 from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
 from aaplug.lab.losses import l1_dssim, structural_similarity
 from aaplug.lab.mipmap_gs import MIN_GRADIENT, MIN_OPACITY, MIPMAP_GS, SPLIT_SHRINKAGE, densify, moments_after
-from aaplug.methods import RECIPES
 from aaplug.methods.presets import recipe_of
-from aaplug.methods.viewers import VIEWERS
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
 from aaplug.system.cores import FREE_CORES
-from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import torch_threads
-from aaplug.verbs.finetune import finetune
 from tests.conftest import make_camera, make_scene, moved, run_python
 
 F64 = torch.float64

@@ -7,9 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.interfaces import Limits
-from aaplug.core.rules import RULES_3DGS, Rules
-from aaplug.core.splats import Splats2D
+from aaplug import RASTERIZERS, RULES_3DGS, Limits, Rules, Splats2D
 from aaplug.lab.gaussian_blending import (
     MAX_POINT_SPAN,
     MIN_WINDOW_VARIANCE,
@@ -21,7 +19,6 @@ from aaplug.lab.gaussian_blending import (
 )
 from aaplug.lab.integral import INTEGRAL
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
 from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of

@@ -17,14 +17,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from aaplug.core.cameras import Camera
+from aaplug import Camera, Gaussians, Renderer, TrainingViews
 from aaplug.core.conventions import ANTIALIASED, CLASSIC
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.rules import RULES_GSPLAT
-from aaplug.core.training import TrainingViews
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rendering.renderer import Renderer
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 SKY = (0.25, 0.5, 1.0)

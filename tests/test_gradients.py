@@ -10,15 +10,8 @@ import torch
 from torch import Tensor
 
 import aaplug
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.training import TrainingViews
-from aaplug.io.scenes.scene import Scene
-from aaplug.methods import RECIPES
-from aaplug.methods.recipe import Recipe
+from aaplug import RECIPES, Camera, CameraSet, Gaussians, Recipe, Renderer, Scene, TrainingViews, UsageError
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, sized
 
 F64 = torch.float64

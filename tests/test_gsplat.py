@@ -19,25 +19,19 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from aaplug.core.cameras import Camera
+from aaplug import RASTERIZERS, RECIPES, Camera, Gaussians, Render, Renderer, UsageError
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
-from aaplug.core.splats import Render
 from aaplug.gsplat import patch, rasterization, rasterization_2dgs
 from aaplug.gsplat.arguments import FIXED
 from aaplug.gsplat.discs import normals_of_depth
 from aaplug.gsplat.drawing import rasterizer_of
 from aaplug.gsplat.on_cuda_alone import compute_relocation, quat_scale_to_covar_preci, spherical_harmonics
 from aaplug.gsplat.patching import REPLACED
-from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.training import TrainingViews
+from aaplug import Gaussians, TrainingViews
 from aaplug.evaluation.coverage import Histogram, check_frame_of, survey
 from aaplug.io.scenes import read_scene, write_parts, write_scene
 from aaplug.methods.conversion import FORMS, fuse

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from aaplug import read_cameras, read_scene, write_scene
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.methods.conversion import FORMS, fuse
 from tests.scene_files import ORACLE
 

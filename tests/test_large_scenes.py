@@ -9,14 +9,9 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from aaplug.core.gaussians import Gaussians
-from aaplug.io.images import read_image
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug import FormatError, Gaussians, Renderer, read_image, read_scene, render, write_scene
 from aaplug.io.scenes.scene import Scene, without_harmonics
 from aaplug.rendering import renderer as rendering
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import FormatError
-from aaplug.verbs.render import render
 from tests.conftest import SAMPLE, make_camera, make_scene, memory_taken, needs_peak_memory
 
 VIEWS = (make_camera(), make_camera(eye=(0.3, -0.5, 0.2), name="inside"))

@@ -6,16 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug import RECIPES, CameraSet, Monitor, Renderer, UsageError, finetune, lod, merge, read_scene, write_scene
 from aaplug.lab.learned import NAMES
-from aaplug.methods import RECIPES
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
-from aaplug.system.monitor import Monitor
-from aaplug.verbs.finetune import finetune
-from aaplug.verbs.lod import lod
-from aaplug.verbs.merge import merge
 from tests.conftest import make_camera, make_scene, sized
 
 VIEW = make_camera(size=(48, 36))

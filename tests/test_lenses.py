@@ -10,17 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
+from aaplug import RULES_3DGS, Camera, Gaussians, Renderer, TrainingViews, UsageError
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
 from aaplug.core.projection import project, project_covariances, rotation_matrices
-from aaplug.core.rules import RULES_3DGS
-from aaplug.core.training import TrainingViews
 from aaplug.io.lenses import Distortion, undistorted, with_lenses
 from aaplug.io.photographs import read_photo
 from aaplug.methods.pixel_kernels.ray import RAY
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene
 
 SIZE = 160, 120

@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.training import TrainingViews
+from aaplug import RASTERIZERS, TrainingViews
 from aaplug.lab.elliptical import MOST_NODES, Elliptical
 from aaplug.lab.integral import INTEGRAL
 from aaplug.lab.obbl import BoundedBandLimit, Renormalized
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.rasterizers import RASTERIZERS
 from tests.conftest import make_camera, make_scene, make_splats
 
 F64 = torch.float64

@@ -9,19 +9,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, Fusion, TrainingViews, UsageError, read_scene
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
-from aaplug.core.gaussians import Fusion
 from aaplug.core.placing import mirrored, placed
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.core.training import TrainingViews
 from aaplug.io.limits import Memory
-from aaplug.io.scenes import read_scene
 from aaplug.methods.conversion import carried
 from aaplug.rendering.agreement import photo_of
 from aaplug.rendering.renderer import own_look
-from aaplug.system.errors import UsageError
 from tests.conftest import make_scene, moved
 from tests.scene_files import oracle
 

@@ -8,10 +8,8 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from aaplug.evaluation import METRICS, PROTOCOLS
-from aaplug.evaluation.metric import Metric
+from aaplug import METRICS, PROTOCOLS, Metric, UsageError
 from aaplug.evaluation.metrics import SSIM, default_metrics, energy_drift, find_metrics, flicker, psnr, ssim
-from aaplug.system.errors import UsageError
 from aaplug.system.registry import spelt
 from tests.test_lpips import lpips_weights
 

@@ -6,13 +6,10 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import CameraSet
-from aaplug.core.pyramids import Pyramid
-from aaplug.core.training import TrainingViews
+from aaplug import CameraSet, Pyramid, TrainingViews, find_recipe
 from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.results import mean
 from aaplug.evaluation.truth import Truth
-from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import LevelChoice, Recipe
 from aaplug.rendering.renderer import Renderer, own_look
 from tests.conftest import make_camera, make_scene

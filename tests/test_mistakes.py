@@ -14,8 +14,7 @@ from aaplug_cli.console import TERMINAL, refuse, table
 from aaplug_cli.main import main
 from rich.console import Console
 
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import write_scene
+from aaplug import read_cameras, write_scene
 from aaplug.system.errors import FormatError, printable
 from aaplug.verbs.batch import status_table
 from tests.conftest import exit_code, make_scene

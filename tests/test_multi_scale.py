@@ -6,12 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug import Gaussians, Renderer, UsageError
 from aaplug.core.conventions import MIP
-from aaplug.core.gaussians import Gaussians
 from aaplug.evaluation.metrics import psnr
 from aaplug.lab.multi_scale import in_one_scene, pixel_sizes
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 LEVELS = 4

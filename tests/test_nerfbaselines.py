@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
+from aaplug import Camera, FormatError, Renderer, UsageError, read_scene, write_scene
 from aaplug.core.colours import WHITE
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.data_sets import MIP_NERF_360, NERF_SYNTHETIC
 from aaplug.evaluation.metrics import psnr, ssim
-from aaplug.io.scenes import read_scene, write_scene
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera, make_scene
 
 EYES = [(0.3, -3.0, 0.4), (2.5, -1.0, -0.5), (-2.0, -2.0, 0.3)]

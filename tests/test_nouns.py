@@ -14,17 +14,13 @@ import torch
 from beartype.roar import BeartypeCallHintParamViolation
 from jaxtyping import TypeCheckError
 
-from aaplug.core.cameras import CameraSet, look_at
+from aaplug import METRICS, RECIPES, CameraSet, Renderer, TrainingViews, look_at
 from aaplug.core.gaussians import Origin
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.core.training import TrainingViews
-from aaplug.evaluation import METRICS
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.scenes import read_scene, scene_of, write_scene
-from aaplug.methods import RECIPES
-from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, listing
 from aaplug.verbs.render import Written
 from tests.conftest import make_camera, make_scene, make_splats, sized

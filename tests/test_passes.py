@@ -9,18 +9,13 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.lenses import Lens
+from aaplug import Gaussians, Lens, Renderer, Splats2D, UsageError, write_scene
 from aaplug.core.passes import PASSES, NormalAxes
-from aaplug.core.splats import Splats2D
 from aaplug.io.image_formats import IMAGE_FORMATS, PNG
-from aaplug.io.scenes import write_scene
 from aaplug.methods.order import Order
 from aaplug.rasterizers.reference import REFERENCE
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.frames import write_frames
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, make_splats
 
 BLACK = (0.0, 0.0, 0.0)

@@ -8,10 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
+from aaplug import FormatError, UsageError, read_image
 from aaplug.core.imaging import box_average, quantised, resampled, stretched
-from aaplug.io.images import read_image
 from aaplug.io.photographs import DOWNSCALES, Photograph, photo_of
-from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera
 
 WHITE = (1.0, 1.0, 1.0)

@@ -25,27 +25,17 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
-from aaplug.core.colours import Colour
-from aaplug.core.splats import Render
-from aaplug.evaluation import METRICS
+from aaplug import METRICS, CameraSet, Colour, Metric, Recipe, Render, Renderer, Scene, check_plugin, evaluate, finetune
 from aaplug.evaluation.laws.base import make_camera, make_scene
-from aaplug.evaluation.metric import Metric
 from aaplug.finetuning import LOSSES
 from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import SCENE_FORMATS, read_scene, write_scene
-from aaplug.io.scenes.scene import Scene
 from aaplug.lab.gaussian_blending import GaussianBlending
 from aaplug.methods.pixel_kernels.point import Point
-from aaplug.methods.recipe import Recipe
-from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError, PlugInError, UsageError
 from aaplug.system.registry import Registry, _points_of
 from aaplug.system.signals import _exit
-from aaplug.verbs.check_plugin import check_plugin
-from aaplug.verbs.evaluate import evaluate
-from aaplug.verbs.finetune import finetune
 from tests.conftest import ROOT, SAMPLE
 from tests.test_documented import GAUSSIANS, few, write_cameras
 

@@ -8,12 +8,10 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug import Camera, CameraSet, Renderer, write_png
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import figure_of, mean
 from aaplug.finetuning.poses import moved_by, refine_pose
-from aaplug.io.images import write_png
-from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene, with_photographs
 
 CHANGE = torch.tensor([0.006, -0.008, 0.005, 0.004, -0.005, 0.006], dtype=torch.float64)  # radians, shares of the depth

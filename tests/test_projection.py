@@ -8,10 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from aaplug import RULES_3DGS, Gaussians, Rules
 from aaplug.core import shading
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project, with_ray_slopes
-from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, moved, straight_camera

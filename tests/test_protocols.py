@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug import PROTOCOLS, UsageError
 from aaplug.core.camera_paths import median_depth
-from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metrics import SSIM
 from aaplug.io.photographs import DOWNSCALES
-from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 

@@ -12,30 +12,22 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import VIEWERS, CameraSet, FormatError, Gaussians, Monitor, Renderer, TrainingViews, lod, read_scene
 from aaplug.core import pyramids
 from aaplug.core.camera_paths import between, free_views, moved
-from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE
 from aaplug.core.pyramids import Cutter, Pyramid, faded
 from aaplug.core.sights import sights
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning import refining
 from aaplug.io.rad import node_sizes, shown_of
-from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.pyramid_folder import MANIFEST, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merge
 from aaplug.methods.presets import recipe_of
-from aaplug.methods.viewers import VIEWERS
-from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import FormatError
-from aaplug.system.monitor import Monitor
-from aaplug.verbs.lod import lod
 from tests.conftest import made_by, make_camera, make_scene, make_splats
 
 RATE = 20.0  # px per world unit

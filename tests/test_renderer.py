@@ -10,17 +10,12 @@ from typing import Any
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug import Camera, CameraSet, Lens, Render, TrainingViews, read_cameras, read_scene
 from aaplug.core.colours import WHITE
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.imaging import average_samples, box_average
-from aaplug.core.lenses import Lens
 from aaplug.core.passes import PASSES
 from aaplug.core.projection import project, rotation_matrices
-from aaplug.core.splats import Render
-from aaplug.core.training import TrainingViews
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
 from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import Smoothing3D

@@ -7,18 +7,16 @@ from functools import cache
 import pytest
 import torch
 
+from aaplug import PixelKernel, Render, UsageError
 from aaplug.core.ellipses import cull
-from aaplug.core.interfaces import PixelKernel
 from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules
-from aaplug.core.splats import Render
 from aaplug.lab.integral import INTEGRAL
 from aaplug.methods import COMPOSITORS, PIXEL_KERNELS
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels
-from aaplug.system.errors import UsageError
 from tests.conftest import ALL_RASTERIZERS, COMPILED, each, make_camera, make_scene, make_splats, splats_of
 
 F64 = torch.float64

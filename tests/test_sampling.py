@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
+from aaplug import Camera, TrainingViews
 from aaplug.core.sampling import check_frame, median_rates, rates_in_chunks, sampling_bounds
-from aaplug.core.training import TrainingViews
 from aaplug.lab.filters import view_information
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.system.errors import FrameError, UsageError

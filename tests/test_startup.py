@@ -10,10 +10,9 @@ from dataclasses import replace
 import pytest
 from aaplug_cli.verbs import VERBS
 
+from aaplug import RECIPES, UsageError
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, RATES, settings_of
-from aaplug.methods import RECIPES
 from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
-from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.registry import REGISTRIES, names_of, registry_of
 from tests.conftest import run_python

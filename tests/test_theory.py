@@ -7,12 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import CameraSet
+from aaplug import RECIPES, CameraSet, Renderer, Splats2D
 from aaplug.core.pyramids import faded
-from aaplug.core.splats import Splats2D
-from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
-from aaplug.rendering.renderer import Renderer
 from tests.bench.theory import CELLS, LARGEST_THIRD, error
 from tests.conftest import make_scene, splats_of, straight_camera
 

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, TrainingViews
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.training import TrainingViews
 from aaplug.levels.clusters import clusters_of, merge_pairs
 from aaplug.levels.merging import Goal, merge
 from aaplug.rendering.renderer import own_look

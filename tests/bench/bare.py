@@ -13,16 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
-from aaplug.core.colours import Colour
+from aaplug import Camera, Colour, Orbit, Renderer, cameras_around, find_recipe
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.sampling import median_rates
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import scene_of
-from aaplug.methods.presets import find_recipe
-from aaplug.options.shared import Orbit
-from aaplug.rendering.assumed import cameras_around
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
 from tests.bench.scenes import CHECKPOINTS, decibels, middle, middle_of, trained
 

@@ -10,17 +10,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.splats import Splats2D
-from aaplug.core.training import TrainingViews
+from aaplug import SCREEN_FILTERS, Camera, CameraSet, Gaussians, Recipe, Renderer, Splats2D, TrainingViews, find_recipe
 from aaplug.evaluation.report.plots import COLOURS, Plot
 from aaplug.lab.integral import INTEGRAL
-from aaplug.methods import SCREEN_FILTERS
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.methods.presets import find_recipe
-from aaplug.methods.recipe import Recipe
-from aaplug.rendering.renderer import Renderer
 
 RATE = 1 / 4  # of the small image, against training
 HALF = 8  # px of training on each side of the Gaussian

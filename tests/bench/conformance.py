@@ -14,9 +14,7 @@ import torch
 from PIL import Image
 
 import aaplug
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import write_png
-from aaplug.io.scenes import read_scene
+from aaplug import read_cameras, read_scene, write_png
 from tests.bench import heading, row
 from tests.bench.viewers import FOLDER, OPENGL, PAGES, Page
 

@@ -15,9 +15,8 @@ from pathlib import Path
 
 import torch
 
+from aaplug import Gaussians, read_scene, write_scene
 from aaplug.core.conventions import CONVENTIONS
-from aaplug.core.gaussians import Gaussians
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.usd import module
 from tests.bench import heading, row
 

@@ -12,13 +12,10 @@ import torch
 from torch import Tensor
 
 import aaplug
+from aaplug import RASTERIZERS, Recipe, find_recipe, warmup
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.projection import quats_of, rotation_matrices
-from aaplug.methods.presets import find_recipe
-from aaplug.methods.recipe import Recipe
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.verbs.warmup import warmup
 from tests.bench import heading, row, timed
 from tests.bench.scenes import decibels, trained
 

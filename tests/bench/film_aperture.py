@@ -9,13 +9,10 @@ from unittest.mock import patch
 
 import torch
 
+from aaplug import Aperture, Camera, Exposure, Renderer, read_cameras, write_png
 from aaplug.core import exposures
 from aaplug.core.camera_paths import orbit
-from aaplug.core.cameras import Aperture, Camera, Exposure
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import write_png
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.scenes import CHECKPOINTS, trained
 from tests.conftest import SAMPLE, SHARED_DATA

@@ -10,19 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Gaussians
+from aaplug import RULES_3DGS, Camera, CameraSet, Gaussians, Renderer, Splats2D, find_recipe, read_cameras, read_scene
 from aaplug.core.imaging import box_average
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, opencv_lens
 from aaplug.core.projection import rotation_matrices
-from aaplug.core.rules import RULES_3DGS
 from aaplug.core.shading import shade
-from aaplug.core.splats import Splats2D
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
 from aaplug.methods.filters.matched import BY_GLOBAL_RATE
-from aaplug.methods.presets import find_recipe
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.room import inside, matrices, room, turned
 from tests.conftest import SAMPLE

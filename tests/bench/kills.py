@@ -20,8 +20,7 @@ from typing import NamedTuple
 
 import psutil
 
-from aaplug.io.images import read_image
-from aaplug.io.scenes import read_scene
+from aaplug import read_image, read_scene
 from aaplug.system.locks import OUR_PREFIX, SCRATCH_PREFIX
 from tests.bench import heading, row
 from tests.conftest import SAMPLE

@@ -19,8 +19,7 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import look_at
-from aaplug.core.gaussians import Gaussians
+from aaplug import Gaussians, look_at
 from aaplug.io.scenes import write_parts
 from aaplug.rendering.benchmark import synthetic_scene
 from tests.bench import heading, row

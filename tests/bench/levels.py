@@ -13,16 +13,12 @@ from typing import Any, Literal
 
 import torch
 
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.pyramids import Pyramid
+from aaplug import Gaussians, Pyramid, Renderer, evaluate, lod
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.io.scenes.pyramid_folder import read_pyramid
 from aaplug.lab.multi_scale import in_one_scene
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.evaluate import evaluate
-from aaplug.verbs.lod import lod
 from tests.bench import heading, row
 from tests.bench.scenes import Trained, decibels, trained
 

@@ -16,25 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aaplug import RECIPES, SH_C0, Limits, Pixels, Recipe, Renderer, Rules, Splats2D, TrainingViews, finetune, grown
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.ellipses import grown
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.interfaces import Limits, Pixels
-from aaplug.core.rules import Rules
-from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.core.splats import Splats2D
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import above_nyquist
 from aaplug.evaluation.metric import Image
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.lab.elliptical import Elliptical
 from aaplug.lab.integral import HALF_U, HALF_V, Integral, principal_columns
 from aaplug.lab.obbl import BoundedBandLimit
-from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels.raster_rows import OPACITY, forms_at
-from aaplug.methods.recipe import Recipe
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.finetune import finetune
 from tests.bench import row, timed
 from tests.bench.scenes import Trained, decibels, trained
 

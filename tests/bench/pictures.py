@@ -11,18 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug import Camera, CameraSet, Gaussians, Renderer, TrainingViews, look_at, read_cameras, read_scene
 from aaplug.core.colours import WHITE
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import resampled
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, opencv_lens
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.plots import COLOURS, MARKERS, Plot
 from aaplug.evaluation.results import CEILING, scale_name
-from aaplug.io.cameras import read_cameras
 from aaplug.io.images import encoded, read_image
-from aaplug.io.scenes import read_scene
-from aaplug.rendering.renderer import Renderer
 from tests.bench.concepts import concepts
 from tests.bench.film_lenses import panorama
 from tests.bench.method_tables import PSNR_COLUMN, Table, table

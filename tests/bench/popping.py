@@ -16,20 +16,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug import RULES_3DGS, Camera, Colour, Renderer, Splats2D, find_recipe
 from aaplug.core import projection, splats
 from aaplug.core.camera_paths import median_depth, orbit, up_of
-from aaplug.core.cameras import Camera
-from aaplug.core.colours import Colour
 from aaplug.core.imaging import resampled
 from aaplug.core.kernels import EAGER
-from aaplug.core.rules import RULES_3DGS
-from aaplug.core.splats import Splats2D
 from aaplug.evaluation.metrics import flip
 from aaplug.io.photographs import photo_of
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
-from aaplug.methods.presets import find_recipe
 from aaplug.rasterizers.tiled.binning import bands
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.scenes import decibels, middle, middle_of, trained
 

@@ -9,11 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
-from aaplug.core.cameras import Camera
+from aaplug import Camera, Renderer, find_recipe
 from aaplug.finetuning.poses import RefinedPose, refine_pose
 from aaplug.io.photographs import photo_of
-from aaplug.methods.presets import find_recipe
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
 from tests.bench.scenes import decibels, trained
 

@@ -8,9 +8,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug import SH_C0, Camera, CameraSet, look_at
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.spherical_harmonics import SH_C0
 
 SIDE = 6.0  # world units, of the cubic room around the origin
 FLATNESS = 0.1  # thickness of a Gaussian against its width

@@ -11,17 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug import Camera, CameraSet, Recipe, Renderer, TrainingViews, read_cameras, read_scene
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.projection import rotation_matrices
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
-from aaplug.methods.recipe import Recipe
-from aaplug.rendering.renderer import Renderer
 from tests.conftest import SHARED_DATA
 
 TEST_VIEWS = 4

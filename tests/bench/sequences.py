@@ -12,13 +12,10 @@ from tempfile import TemporaryDirectory
 import torch
 from scipy.spatial.transform import Rotation
 
+from aaplug import CameraSet, Gaussians, evaluate, read_scene, write_scene
 from aaplug.core.camera_paths import median_depth, moved
-from aaplug.core.cameras import CameraSet
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
 from aaplug.evaluation.results import mean
-from aaplug.io.scenes import read_scene, write_scene
-from aaplug.verbs.evaluate import evaluate
 from tests.bench import heading, row
 from tests.bench.scenes import CHECKPOINTS, Trained, trained
 

@@ -16,11 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
+from aaplug import SH_C0, VIEWERS, Camera, Gaussians
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.methods.viewers import VIEWERS
 from tests.bench import heading, row
 from tests.bench.viewers import PAGES
 

@@ -24,15 +24,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 import aaplug
+from aaplug import Gaussians, write_scene
 from aaplug.core.camera_paths import median_depth, moved
 from aaplug.core.colours import WHITE
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Level
 from aaplug.core.sampling import median_rates
 from aaplug.io import StreamName
-from aaplug.io.scenes import write_scene
 from aaplug.io.streamed import SETTINGS, STREAMS, write_index, write_level
 from tests.bench import heading, row, scenes
 from tests.bench.scenes import decibels

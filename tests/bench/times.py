@@ -4,10 +4,8 @@ import time
 from functools import partial
 from importlib.resources import as_file, files
 
+from aaplug import Renderer, read_cameras, read_scene
 from aaplug.core.colours import WHITE
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
-from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row, timed
 from tests.bench.method_tables import keep
 

@@ -21,10 +21,9 @@ from dataclasses import dataclass, field, replace
 import torch
 from websockets.sync.client import ClientConnection, connect
 
+from aaplug import Camera, CameraSet, serving
 from aaplug.core import camera_paths
-from aaplug.core.cameras import Camera, CameraSet
 from aaplug.rendering.benchmark import synthetic_camera, synthetic_scene
-from aaplug.verbs.view import serving
 from tests.bench import heading, row
 
 WINDOW = (1280, 720)  # px

@@ -23,22 +23,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug import Camera, CameraSet, Gaussians, Renderer, TrainingViews, convert, read_cameras, read_image
 from aaplug.core.colours import WHITE
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.orbits import frame_of
-from aaplug.core.training import TrainingViews
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import read_image
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.streamed import STREAMS, write_index, write_level
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.convert import convert
 from tests.bench import heading, row
 from tests.bench.method_tables import TABLES, keep
 from tests.bench.scenes import decibels

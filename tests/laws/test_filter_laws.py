@@ -8,13 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from aaplug import SCREEN_FILTERS, WORLD_FILTERS, TrainingViews
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.convolution import fuse_stored
 from aaplug.core.projection import project
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.laws.filters import CAMERAS, F64, SCENE, SITUATIONS, spheres, trained_with, world_scene
 from aaplug.lab.filters import AnisotropicSmoothing, FlatSmoothing
-from aaplug.methods import SCREEN_FILTERS, WORLD_FILTERS
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE, PIXEL_VARIANCE, Matched
 from aaplug.methods.filters.smoothing import Smoothing3D

@@ -9,16 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Limits, Pixels
+from aaplug import PIXEL_KERNELS, RULES_3DGS, Camera, Gaussians, Limits, Pixels, Splats2D
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
-from aaplug.core.rules import RULES_3DGS
-from aaplug.core.splats import Splats2D
 from aaplug.evaluation.laws.drawing import COARSE, require_bounds, some_splats
 from aaplug.lab.integral import INTEGRAL
 from aaplug.lab.surfel_mip import SURFEL_MIP
-from aaplug.methods import PIXEL_KERNELS
 from aaplug.methods.pixel_kernels import point
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY

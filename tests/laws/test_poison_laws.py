@@ -6,12 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.training import TrainingViews
-from aaplug.methods import RECIPES
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug import RECIPES, Camera, Gaussians, Renderer, TrainingViews, UsageError
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 CAMERA = make_camera(size=(40, 30))

@@ -11,10 +11,7 @@ import pytest
 import torch
 from torch.autograd.gradcheck import GradcheckError
 
-from aaplug.core.convolution import smoothed_by
-from aaplug.core.gaussians import Fusion
-from aaplug.core.rules import RULES_3DGS
-from aaplug.evaluation import METRICS
+from aaplug import METRICS, RECIPES, RULES_3DGS, SCREEN_FILTERS, Fusion, smoothed_by
 from aaplug.evaluation.laws import LAWS, drawing, files, filters, recipes
 from aaplug.evaluation.laws.drawing import (
     alpha_is_exact,
@@ -41,7 +38,6 @@ from aaplug.evaluation.laws.recipes import (
 )
 from aaplug.io.scenes import ply, usd
 from aaplug.lab.gaussian_blending import GaussianBlending
-from aaplug.methods import RECIPES, SCREEN_FILTERS
 from aaplug.methods.pixel_kernels.point import Point
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.rasterizers.tiled import Tiled
