@@ -118,16 +118,6 @@ def test_a_lens_that_shows_little_of_its_pinhole_has_no_photograph(tmp_path):
     assert undistorted(image, None) is image
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_the_lenses_are_colmaps(name):
-    pycolmap = pytest.importorskip("pycolmap")
-    lens = MODELS[name]
-    theirs = pycolmap.Camera(model=lens[0], width=SIZE[0], height=SIZE[1], params=[*PINHOLE, *lens[1]])
-    rays = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
-    points = theirs.img_from_cam(np.concatenate([rays, np.ones((50, 1))], axis=1))
-    np.testing.assert_allclose(points, bend(rays, lens) * PINHOLE[:2] + PINHOLE[2:], atol=1e-9)
-
-
 THIN_PRISM = Lens("equidistant", (-0.05, 0.01), tangential=(0.01, -0.01), prism=(0.01, 0.0, 0.02, 0.0))
 ALL_LENSES = {
     "equidistant": EQUIDISTANT,
@@ -319,20 +309,6 @@ def test_a_panorama_has_neither_seam_nor_pole():
     expected = cv2.remap(image.numpy(), (x % 192).numpy(), y.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     error = (torch.from_numpy(expected) - rolled)[8:-8].square().mean().sqrt()
     assert error < 0.02  # interpolation
-
-
-def test_gradients_through_a_lens_are_finite_differences():
-    scene = make_scene(12, dtype=torch.float64)
-    camera = view_through(EQUIDISTANT, side=16)
-    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0))])
-    weights = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-
-    def loss(means: torch.Tensor) -> torch.Tensor:
-        moved = replace(scene, means=means)
-        return (Renderer.of(moved, training, "classic", rasterizer="eager")(camera).rgb * weights).sum()
-
-    means = scene.means.clone().requires_grad_()
-    assert torch.autograd.gradcheck(loss, means, rtol=1e-4, atol=1e-6, fast_mode=True)
 
 
 def test_a_recipe_of_discs_says_that_it_has_no_lens():

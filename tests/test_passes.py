@@ -10,7 +10,7 @@ import torch
 
 import aaplug
 from aaplug import Gaussians, Lens, Renderer, Splats2D, UsageError, write_scene
-from aaplug.core.passes import PASSES, NormalAxes
+from aaplug.core.passes import PASSES
 from aaplug.io.image_formats import IMAGE_FORMATS, PNG
 from aaplug.methods.order import Order
 from aaplug.rasterizers.reference import REFERENCE
@@ -22,35 +22,33 @@ BLACK = (0.0, 0.0, 0.0)
 TILT = math.radians(35)  # of the plane against the image
 
 
-def plane(tilt: float = TILT, count: int = 120, side: float = 3.0) -> Gaussians:
-    """A textured square of discs in the plane through the origin of `normal_of`, in any order."""
+def plane(count: int = 120, side: float = 3.0) -> Gaussians:
+    """A textured square of discs in a tilted plane through the origin, in any order."""
     at = (torch.arange(count) + 0.5) / count * side - side / 2
     u, v = (x.flatten() for x in torch.meshgrid(at, at, indexing="ij"))
     order = torch.randperm(len(u), generator=torch.Generator().manual_seed(0))
-    means = torch.stack([u, v * math.sin(tilt), v * math.cos(tilt)], dim=1)[order]
+    means = torch.stack([u, v * math.sin(TILT), v * math.cos(TILT)], dim=1)[order]
     n, width = len(means), 0.7 * side / count
     log_scales = torch.tensor([width, width, 1e-4]).log().expand(n, 3)
-    turn = (math.pi / 2 - tilt) / 2  # half the angle from z to the normal
+    turn = (math.pi / 2 - TILT) / 2  # half the angle from z to the normal
     quats = torch.tensor([math.cos(turn), math.sin(turn), 0.0, 0.0]).expand(n, 4)
     colours = torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(1)) * 3 - 1.5
     return Gaussians(means, quats.contiguous(), log_scales.contiguous(), torch.full((n,), 4.0), colours)
-
-
-def normal_of(tilt: float) -> torch.Tensor:
-    """Towards cameras at negative y."""
-    return torch.tensor([0.0, -math.cos(tilt), math.sin(tilt)])
 
 
 CAMERA = make_camera((0.4, -4.0, 0.3), (96, 72), name="v")
 SMALL = make_camera((0.0, -4.0, 0.3), (64, 48), name="v")
 
 
-def plane_errors(tilt: float, scale: float, axes: NormalAxes = "world") -> dict[str, float]:
-    """Largest errors on a textured plane: of depths and of position as shares of the depth, of normals in degrees."""
-    renderer, camera = Renderer.of(plane(tilt), [CAMERA], rasterizer="eager"), CAMERA.scaled(scale)
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+@pytest.mark.parametrize("axes", ["camera", "world"])
+def test_depth_normal_and_position_of_a_textured_plane(scale, axes):
+    """Largest errors: of depths and of position as shares of the depth, of normals in degrees."""
+    renderer, camera = Renderer.of(plane(), [CAMERA], rasterizer="eager"), CAMERA.scaled(scale)
     assert renderer.samples(camera) == (1 if scale == 1 else 2)
     drawn = renderer.passes(camera, list(PASSES), axes)
-    rotation, centre, normal = camera.cam_from_world[:3, :3].float(), camera.centre.float(), normal_of(tilt)
+    rotation, centre = camera.cam_from_world[:3, :3].float(), camera.centre.float()
+    normal = torch.tensor([0.0, -math.cos(TILT), math.sin(TILT)])  # towards cameras at negative y
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=2)
     depth = -(centre @ normal) / (rays @ rotation @ normal)
@@ -60,13 +58,7 @@ def plane_errors(tilt: float, scale: float, axes: NormalAxes = "world") -> dict[
     off = (drawn["position"] - centre - depth[..., None] * (rays @ rotation)).norm(dim=2) / depth
     seen = normal if axes == "world" else rotation @ normal * torch.tensor([1.0, -1.0, -1.0])
     angle = (drawn["normal"] @ seen).clamp(max=1).acos().rad2deg()
-    return {name: float(x[covered].max()) for name, x in (depths | {"position": off, "normal": angle}).items()}
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.25])
-@pytest.mark.parametrize("axes", ["camera", "world"])
-def test_depth_normal_and_position_of_a_textured_plane(scale, axes):
-    error = plane_errors(TILT, scale, axes)
+    error = {name: float(x[covered].max()) for name, x in (depths | {"position": off, "normal": angle}).items()}
     limits = {"depth": 0.001, "depth-median": 0.015, "depth-nearest": 0.025, "position": 0.002, "normal": 0.1}
     assert all(error[name] < limit for name, limit in limits.items()), error
 

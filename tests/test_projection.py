@@ -1,9 +1,8 @@
-"""The precision of projection, and orthonormal harmonics.  test_golden.py has the formulas."""
+"""The precision of projection.  test_golden.py has the formulas, test_gsplat.py those of gsplat and of harmonics."""
 
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -12,7 +11,6 @@ from aaplug import RULES_3DGS, Gaussians, Rules
 from aaplug.core import shading
 from aaplug.core.projection import project, with_ray_slopes
 from aaplug.core.shading import shade
-from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, moved, straight_camera
 
 F64 = torch.float64
@@ -76,62 +74,6 @@ def test_a_scene_far_from_the_origin_projects_as_if_it_were_near():
     torch.testing.assert_close(there.covs, here.covs, rtol=1e-4, atol=1e-4)
     shaded = shade(there, far, away), shade(here, scene, camera)
     torch.testing.assert_close(shaded[0].rgb, shaded[1].rgb, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 3.0])
-def test_scaling_a_camera_scales_means_and_covariances(factor):
-    camera = replace(make_camera(size=(64, 48)), cx=24.0, cy=20.0)
-    scene = make_scene(50, dtype=F64)
-    scene = replace(scene, means=scene.means * 2)  # some beyond where the derivative stops
-    before, after = project(scene, camera), project(scene, camera.scaled(factor))
-    for name, power in (("means", 1), ("covs", 2), ("dets", 4), ("depths", 0)):
-        torch.testing.assert_close(getattr(after, name), getattr(before, name) * factor**power)
-
-
-# colour -----------------------------------------------------------------------------------------
-
-PI = math.pi
-
-
-def basis(directions: torch.Tensor, functions: int = 25) -> torch.Tensor:
-    """Value of each function in each direction, from the colour of scenes with that function only."""
-    m = len(directions)
-    columns = []
-    for k in range(functions):
-        sh = torch.zeros(m, functions, 3, dtype=F64)
-        sh[:, k, 1] = 1.0
-        columns.append(sh_colour(sh, directions)[:, 1] - 0.5)
-    return torch.stack(columns, dim=1)
-
-
-def test_spherical_harmonics_are_orthonormal():
-    # Gauss-Legendre in z and equal steps around: exact for the products, which have degree 8
-    z, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(5))
-    around = torch.arange(10, dtype=F64) * PI / 5 + 0.1
-    z, angle = torch.cartesian_prod(z, around).T
-    weights = weights.repeat_interleave(10) * PI / 5
-    radius = (1 - z * z).sqrt()
-    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
-    gram = values.T @ (weights[:, None] * values)
-    torch.testing.assert_close(gram, torch.eye(25, dtype=F64), atol=1e-9, rtol=0)
-
-
-def test_orders_m_and_minus_m_are_rotations_of_one_function():
-    """Order −m is order m rotated by a quarter of its period about z."""
-    z = torch.tensor([0.3], dtype=F64)
-    r = (1 - z * z).sqrt()
-
-    def at(angle: float) -> torch.Tensor:
-        a = torch.tensor([angle], dtype=F64)
-        return basis(torch.stack([r * a.cos(), r * a.sin(), z], dim=1))[0]
-
-    for degree in (2, 3, 4):
-        for m in range(1, degree + 1):
-            middle = degree * degree + degree
-            quarter = at(0.4 + PI / (2 * m))  # sin becomes cos there
-            torch.testing.assert_close(quarter[middle - m], at(0.4)[middle + m])
-        pole = basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))[0]
-        assert pole[middle] == pytest.approx(((2 * degree + 1) / (4 * PI)) ** 0.5)
 
 
 def test_shading_in_chunks_gives_the_same_colours(monkeypatch):

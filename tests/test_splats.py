@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from aaplug.core.convolution import smoothed_by, volume_log_factor
-from aaplug.core.ellipses import cull, squared_cutoff, whitening
+from aaplug.core.ellipses import cull, whitening
 from aaplug.core.gaussians import MIN_OPACITY, scale_opacities
 from aaplug.core.splats import Splats2D
 from tests.conftest import make_scene, make_splats, splats_of
@@ -84,13 +84,6 @@ def test_a_splat_of_no_area_has_finite_gradients_when_blurred(factor):
     blurred = replace(point, covs=inputs[0], dets=inputs[1]).blurred(0.3, compensate=True)
     gradients = torch.autograd.grad(getattr(blurred, factor).sum(), inputs, allow_unused=True)
     assert all(g.isfinite().all() for g in gradients if g is not None)
-
-
-def test_alpha_is_1_255_at_the_cutoff():
-    splats = splat(4.0, 0.0, 9.0, opacity=0.8)
-    distance = squared_cutoff(splats.opacities).item()
-    assert 0.8 * math.exp(-distance / 2) == pytest.approx(1 / 255)
-    assert squared_cutoff(torch.tensor([0.003])).item() < 0  # too faint to draw
 
 
 def test_whitening_is_a_square_root_of_the_inverse_covariance():

@@ -49,13 +49,6 @@ def test_matched_adds_what_the_pixel_lacks():
         assert (xx, xy, yy) == pytest.approx((wanted, 0.0, wanted), abs=1e-9)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 8])
-def test_the_mean_of_training_pixels_has_this_variance(n):
-    rate = 1 / n
-    places = [(i + 0.5) * rate - 0.5 for i in range(n)]
-    assert sum(x * x for x in places) / n == pytest.approx((1 - rate**2) / 12, abs=1e-12)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 1.0])
 def test_two_levels_together_keep_the_light_of_one(share):
     """Statement 7."""
