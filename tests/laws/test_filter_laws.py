@@ -216,15 +216,6 @@ def test_matched_energy_shows_in_a_compensating_viewer_what_training_showed(conv
     assert fused.convention == MIP
 
 
-def test_matched_energy_averages_over_the_cameras_that_see_a_gaussian():
-    scene = make_scene(10, dtype=F64)
-    blind = replace(CAMERAS[1], cx=1e5)
-    alone = MatchedEnergy()(scene, TrainingViews.of(scene, CAMERAS[:1]))
-    beside = MatchedEnergy()(scene, TrainingViews.of(scene, [CAMERAS[0], blind, blind]))
-    torch.testing.assert_close(beside.log_scales, alone.log_scales)
-    torch.testing.assert_close(beside.logit_opacities, alone.logit_opacities)
-
-
 def test_matched_energy_keeps_an_opacity_of_0():
     scene = make_scene(3)
     scene.logit_opacities[1] = -200.0
