@@ -89,6 +89,8 @@ def test_what_the_machine_cannot_hold_is_refused(renderer, machine_alone, monkey
         job(Heard()).announce([renderer], [make_camera(size=(1000, 1000))])
     with pytest.raises(UsageError, match=r"1,000,000 with gradients take 1.2 GB, more than"):
         bench(gaussians=(1_000_000,), resolution=("10x10",), rasterizer="eager", repeats=1)
+    with pytest.raises(UsageError, match=r"view view at 9000x9000: with 1×1 samples per pixel would take 2.6 GB, more"):
+        renderer(make_camera(size=(9000, 9000)))
 
 
 FAR = Orbit(eye=(0.0, 0.0, 1000.0))
@@ -134,12 +136,6 @@ def test_samples_have_a_bound(factor):
     tiny = camera.scaled(factor)
     assert renderer.samples(tiny) == MAX_SAMPLES
     assert renderer(tiny).rgb.shape == (1, 1, 3)
-
-
-def test_an_image_that_memory_does_not_hold_is_refused_from_python_too(renderer, monkeypatch):
-    monkeypatch.setenv("AAPLUG_MEMORY_SHARE", "1e-3")
-    with pytest.raises(UsageError, match=r"view view at 9000x9000: with 1×1 samples per pixel would take 2.6 GB, more"):
-        renderer(make_camera(size=(9000, 9000)))
 
 
 @pytest.mark.parametrize(

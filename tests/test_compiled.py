@@ -479,6 +479,7 @@ def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
 
 
 PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray"}
+EVERY = {kernel.name for kernel in compiled.KERNELS}
 
 
 def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.Tensor:
@@ -496,29 +497,18 @@ def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.
         (projection, "MAX_SIGMA", 1e8, {"project", "project-backward"}),
         (shading, "COMPILED_COEFFICIENTS", (4,), set()),
         (forward, "EXAMPLE_TILES", 8, PASSES),
+        (compiled, "OPTIONS", {"max_fusion_size": 1}, EVERY),
+        (compiled, "_compiler_version", lambda compiler: "g++ 99", EVERY),
+        (compiled, "_processor", lambda: "another", EVERY),
+        (compiled, "_compiler", lambda: "clang++", EVERY),
     ],
 )
-def test_a_change_of_a_kernels_sources_is_a_change_of_its_package_alone(monkeypatch, module, name, value, changed):
+def test_what_a_kernel_is_compiled_from_and_by_names_its_package(monkeypatch, module, name, value, changed):
     before = paths()
     assert paths() == before
     monkeypatch.setattr(module, name, value)
     after = paths()
     assert {kernel for kernel in before if before[kernel] != after[kernel]} == changed
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("OPTIONS", {"max_fusion_size": 1}),
-        ("_compiler_version", lambda compiler: "g++ 99"),
-        ("_processor", lambda: "another"),
-        ("_compiler", lambda: "clang++"),
-    ],
-)
-def test_other_options_compilers_and_processors_have_other_packages(monkeypatch, name, value):
-    before = paths()
-    monkeypatch.setattr(compiled, name, value)
-    assert not {*before.values()} & {*paths().values()}
 
 
 def test_a_bundle_serves_every_python_and_every_build_of_its_torch(monkeypatch):

@@ -147,12 +147,10 @@ def test_evaluations_of_every_kernel_and_compositor_are_counted_and_fewer_where_
     assert 0 < small < full
 
 
-def test_a_rasterizer_that_does_not_count_has_no_evaluations(look, views):
+def test_a_rasterizer_that_does_not_count_and_a_compositor_without_kernels_have_no_evaluations(look, views):
     slow = replace(look, rasterizer=RASTERIZERS["reference"])
     assert evaluate(task(slow, views[:1], scales=(0.5,))).measurements[0].evaluations is None
 
-
-def test_a_compositor_without_kernels_has_no_evaluations(look, views):
     def tiles(rows, window, order, first, counts, centres, *_):
         return torch.zeros(4, *centres[0].shape)
 

@@ -292,16 +292,6 @@ def test_a_lens_that_bends_moves_but_has_no_aperture():
     assert not torch.equal(renderer(moving).rgb, renderer(panorama).rgb)
 
 
-def test_a_shutter_moves_parallel_views():
-    path = [replace(view, lens=ORTHO) for view in (VIEW, MOVED)]
-    filmed_path = filmed(path, FilmOptions(shutter=1.0, samples=4), True)
-    renderer = aaplug.Renderer.of(make_scene(30), [VIEW], "matched", min_seen=0.0)
-    few, many = (
-        renderer(view) for view in (filmed_path[0], filmed(path, FilmOptions(shutter=1.0, samples=64), True)[0])
-    )
-    assert psnr(few.rgb, many.rgb) > 40
-
-
 def test_a_camera_to_is_one_view_for_one():
     with pytest.raises(UsageError, match=r"camera_to: names one view, for one of `views` .*; got 1 view for 2 views"):
         filmed([VIEW, VIEW], FilmOptions(), False, camera_to=[MOVED])
