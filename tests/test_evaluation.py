@@ -1,4 +1,4 @@
-"""Evaluation: what is compared with what, and what the report holds."""
+"""Evaluation: what is compared with what, what a scale does to a camera, what the report and the journal hold."""
 
 import json
 import math
@@ -9,17 +9,20 @@ import pytest
 import torch
 
 from aaplug import METRICS, PROTOCOLS, RASTERIZERS, RECIPES, TrainingViews, find_recipe, read_image, write_png
+from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import Camera, Exposure, Undistortion
 from aaplug.core.colours import WHITE
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.evaluation.engine import Task, evaluate, renderers_of
 from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
 from aaplug.evaluation.results import (
     CEILING,
     NO_PHOTOGRAPH,
+    Measurement,
     as_csv,
     mean,
     method,
@@ -30,9 +33,10 @@ from aaplug.evaluation.results import (
     tables,
 )
 from aaplug.evaluation.truth import Truth, ViewTruth, back_projected
+from aaplug.io.photographs import DOWNSCALES
 from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING
 from aaplug.rendering.renderer import Renderer, own_look
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene, with_photographs
 
 
@@ -411,3 +415,113 @@ def test_recipes_rank_as_measured_on_the_sample(sample_scene, sample_cameras, sa
     assert dB["classic"] + 7 < dB["mip"] < dB["matched"] < dB["auto"] - 6, dB
     assert dB["classic"] + 17 < dB["auto"]
     assert dB[CEILING] - dB["auto"] < 0.7
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
+def test_scale_one_is_the_view_itself_and_names_exist(protocol):
+    view = make_camera()
+    camera = protocol.camera(view, 1.0, 4.0)
+    assert (camera.hw, camera.intrinsics) == (view.hw, view.intrinsics)
+    assert camera.cam_from_world.equal(view.cam_from_world)
+    assert (protocol.downscale in DOWNSCALES, protocol.ssim in SSIM, bool(protocol.source)) == (True, True, True)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
+@pytest.mark.parametrize("scale", [0.25, 2.0])
+def test_every_protocol_samples_what_is_in_the_middle_by_the_scale(protocol, scale):
+    view = make_camera((0.0, -4.0, 0.0))
+    camera = protocol.camera(view, scale, 4.0)
+    depth = camera.cam_from_world[2, 3].item()  # of the world's origin, which the view looks at
+    assert camera.fx / depth == pytest.approx(scale * view.fx / 4.0)
+
+
+def test_cameras_of_moved_and_of_whole_sized_protocols():
+    view = make_camera(size=(987, 743))
+    assert PROTOCOLS["distance"].camera(view, 0.5, 4.0).trained_focal is None
+    assert PROTOCOLS["fov"].camera(view, 0.5, 4.0).trained_focal == view.trained_focal
+    assert PROTOCOLS["360-zoom-out"].camera(view, 0.25, 1.0).hw == (186, 247)  # rounded, as 3DGS does
+    assert PROTOCOLS["default"].camera(view, 0.25, 1.0).hw == (185, 246)
+
+
+def test_median_depth_is_of_what_the_view_shows():
+    scene, view = make_scene(500), make_camera((0.0, -4.0, 0.0))
+    depths = scene.means @ view.cam_from_world[2, :3].float() + view.cam_from_world[2, 3].float()
+    assert depths.min() < median_depth(scene.means, view) < depths.max()
+    backwards = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double()
+    away = replace(view, cam_from_world=backwards @ view.cam_from_world)
+    with pytest.raises(UsageError, match="sees no Gaussian"):
+        median_depth(scene.means, away)
+
+
+REQUEST = {"views": 3, "scales": [1.0, 0.1], "versions": {"aaplug": "1", "torch": "2"}}
+
+
+def measured(view: str) -> Measurement:
+    return Measurement("auto", 0.1, view, {"PSNR": 1 / 3, "SSIM": None}, 2, 0.125, "note", 7)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A journal of two finished views."""
+    with Journal(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False) as journal:
+        for i, name in enumerate("ab"):
+            journal.add(i, [measured(name)])
+    return journal.path
+
+
+def test_what_is_finished_comes_back_to_the_bit_and_zeros_of_a_lost_disk_do_not(path):
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\0" * 50 + b"\n")
+    with Journal(path, REQUEST, resume=True) as journal:
+        assert journal.views == {0: (measured("a"),), 1: (measured("b"),)}
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(("end", "views"), [(-1, "a"), (-20, "a"), (-60, "a"), (10, "")])
+def test_a_torn_line_is_forgotten_and_written_again(path, end, views):
+    whole = path.read_bytes()
+    path.write_bytes(whole[:end])
+    with Journal(path, REQUEST, resume=True) as journal:
+        assert len(journal.views) == len(views)
+        for i, name in list(enumerate("ab"))[len(views) :]:
+            journal.add(i, [measured(name)])
+    assert path.read_bytes() == whole
+
+
+def test_another_request_is_refused_by_what_changed_until_the_journal_is_removed(path):
+    other = {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}
+    with pytest.raises(UsageError, match=r"another aaplug \(scales, versions.torch changed.* or remove the file"):
+        Journal(path, other, resume=True)
+    path.unlink()
+    assert not Journal(path, other, resume=True).views
+
+
+def test_without_resume_it_starts_anew(path):
+    with Journal(path, REQUEST | {"views": 9}, resume=False) as journal:
+        journal.add(0, [measured("c")])
+    assert len(path.read_text().splitlines()) == 2
+
+
+def test_two_processes_do_not_share_a_journal(path):
+    with Journal(path, REQUEST, resume=True), pytest.raises(UsageError, match="another process"):
+        Journal(path, REQUEST, resume=True)
+
+
+def test_nothing_is_made_before_the_first_view_and_a_place_that_cannot_be_written_is_named(tmp_path):
+    with Journal(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True):
+        assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    journal = Journal(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
+    with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):
+        journal.add(0, [measured("a")])
+
+
+DAMAGED = ("{}", "[]", '{"view": 0}', '{"view": 0, "measurements": [{}]}', '{"view": [], "measurements": []}')
+
+
+@pytest.mark.parametrize("line", DAMAGED)
+def test_a_line_that_is_no_measurement_is_refused(tmp_path, line):
+    path = tmp_path / "progress.jsonl"
+    path.write_text('{"request": {}}\n' + line + "\n")
+    with pytest.raises(FormatError, match="its line 2 is damaged"):
+        Journal(path, {}, resume=True)
