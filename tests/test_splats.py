@@ -1,16 +1,24 @@
-"""Blurring on the screen and smoothing in the world: published values, needles and extremes."""
+"""Splats: projection, blurring on the screen and smoothing in the world: published values, needles and extremes.
+
+test_golden.py has projection's formulas, test_gsplat.py those of gsplat and of harmonics.
+"""
 
 import math
 from dataclasses import replace
+from decimal import Decimal, localcontext
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from aaplug import RULES_3DGS, Rules, Splats2D
+from aaplug.core import shading
 from aaplug.core.convolution import smoothed_by, volume_log_factor
 from aaplug.core.ellipses import cull, whitening
-from aaplug.core.gaussians import MIN_OPACITY, scale_opacities
-from aaplug.core.splats import Splats2D
-from tests.conftest import make_scene, make_splats, splats_of
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians, scale_opacities
+from aaplug.core.projection import project, with_ray_slopes
+from aaplug.core.shading import shade
+from tests.conftest import make_camera, make_scene, make_splats, moved, splats_of, straight_camera
 
 F64 = torch.float64
 
@@ -165,18 +173,11 @@ def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(l
 
 
 def scaled_logit(logit: float, factor: float, most: float) -> float:
-    """logit(o·c), o·c held in [MIN_OPACITY, most], in Python's floats and without cancellation near 1."""
-    if logit > 0:
-        rest = math.exp(-logit) / (1 + math.exp(-logit))  # 1 − o
-        opacity, missing = (1 - rest) * factor, (1 - factor) + factor * rest
-    else:
-        opacity = math.exp(logit) / (1 + math.exp(logit)) * factor
-        missing = 1 - opacity
-    if opacity < MIN_OPACITY:
-        opacity, missing = MIN_OPACITY, 1 - MIN_OPACITY
-    if missing < 1 - most:
-        opacity, missing = most, 1 - most
-    return math.log(opacity) - math.log(missing)
+    """logit(o·c), o·c held in [MIN_OPACITY, most], in decimal numbers of 80 digits."""
+    with localcontext(prec=80):
+        opacity = Decimal(factor) / (1 + Decimal(-logit).exp())
+        opacity = min(max(opacity, Decimal(MIN_OPACITY)), Decimal(most))
+        return float((opacity / (1 - opacity)).ln())
 
 
 @pytest.mark.parametrize("logit", [-100.0, -20.0, -5.5, -1.0, 0.0, 1.0, 5.0, 12.0, 20.0, 100.0])
@@ -207,3 +208,88 @@ def test_scaled_opacities_have_the_gradient_of_their_formula():
     logits = torch.linspace(-6, 6, 13, dtype=F64, requires_grad=True)
     log_factor = torch.linspace(-3, -0.01, 13, dtype=F64, requires_grad=True)
     assert torch.autograd.gradcheck(scale_opacities, (logits, log_factor))
+
+
+@pytest.mark.parametrize("near", [0.01, RULES_3DGS.near, 2.0])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_what_lies_beyond_the_near_plane_is_drawn_and_the_plane_itself_is_not(dtype, near):
+    scene = make_scene(5, dtype=dtype)
+    depths = torch.tensor([near, 1.001 * near, -1.0, 0.0, 3.0], dtype=dtype)
+    scene = replace(scene, means=torch.nn.functional.pad(depths[:, None], (2, 0)))
+    splats = project(scene, straight_camera(), rules=Rules(near=near))
+    assert splats.sources.tolist() == [1, 4]
+    torch.testing.assert_close(splats.depths, depths[[1, 4]])
+    torch.testing.assert_close(splats.opacities, scene.opacities[[1, 4]])
+
+
+def needles(n: int, long: float, thin: float) -> Gaussians:
+    """Needles of `long` × `thin` px, in random orientations but never end-on, near the axis of a straight camera."""
+    g = torch.Generator().manual_seed(0)
+    turn, tilt = torch.rand(2, n, generator=g, dtype=F64)
+    # a tilt about the needle's own y, then a turn about the optical axis
+    rotations = Rotation.from_euler("ZY", torch.stack([math.pi * turn, 2 * tilt - 1], dim=1).numpy())
+    quats = torch.from_numpy(rotations.as_quat()).roll(1, dims=1)
+    means = torch.nn.functional.pad(torch.randn(n, 2, generator=g, dtype=F64), (0, 1), value=5.0)
+    scales = torch.tensor([long, thin, thin], dtype=F64) * 5.0 / 100
+    return Gaussians(means, quats, scales.log().expand(n, 3), torch.zeros_like(turn), torch.zeros(n, 1, 3, dtype=F64))
+
+
+@pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])
+def test_the_determinant_of_a_needle_is_exact_in_float32(long, thin):
+    scene, camera = needles(500, long, thin).to(torch.float32), straight_camera()
+    single, exact = project(scene, camera), project(scene.to(F64), camera)
+    from_covariance = single.covs[:, 0] * single.covs[:, 2] - single.covs[:, 1].square()
+    lost = (from_covariance.double() / exact.dets - 1).abs()
+    assert lost.median() > 1e-3, "the plain formula should fail for a needle this thin"
+    error = (single.dets.double() / exact.dets - 1).abs()
+    assert error.max() < 1e-5
+
+
+def test_the_determinant_of_a_disc_seen_edge_on_is_not_negative():
+    columns = {"means": [[0.0, 0.0, 2.0]], "quats": [[1.0, 0.0, 0.0, 0.0]], "log_scales": [[0.0, -46.0, 0.0]]}
+    scene = replace(make_scene(1), **{name: torch.tensor(column) for name, column in columns.items()})
+    splats = project(scene, straight_camera())
+    assert splats.dets.item() >= 0
+    assert splats.covs.isfinite().all()
+
+
+def test_a_scene_far_from_the_origin_projects_as_if_it_were_near():
+    offset = torch.tensor([2.0**22, -(2.0**22), 2.0**22], dtype=F64)
+    scene, camera = make_scene(50, dtype=F64), make_camera((0.13, -4.07, 0.21))
+    scene = replace(scene, means=scene.means.mul(2).round().div(2)).to(torch.float32)
+    far = replace(scene, means=(scene.means.double() + offset).float())
+    assert (far.means.double() - offset).equal(scene.means.double()), "halves are exact out there"
+    away = moved(camera, offset)
+    there, here = project(far, away), project(scene, camera)
+    torch.testing.assert_close(there.means, here.means, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(there.covs, here.covs, rtol=1e-4, atol=1e-4)
+    shaded = shade(there, far, away), shade(here, scene, camera)
+    torch.testing.assert_close(shaded[0].rgb, shaded[1].rgb, rtol=1e-5, atol=1e-5)
+
+
+def test_shading_in_chunks_gives_the_same_colours(monkeypatch):
+    scene, camera = make_scene(50, degree=3), make_camera()
+    splats, sh = project(scene, camera), scene.sh.clone().requires_grad_()
+    whole = shade(splats, replace(scene, sh=sh), camera).rgb
+    [gradient] = torch.autograd.grad(whole.square().sum(), [sh])
+    monkeypatch.setattr(shading, "SPLATS_PER_CALL", 7)
+    assert len(splats.sources) > 7
+    parts = shade(splats, replace(scene, sh=sh), camera).rgb
+    assert parts.equal(whole)
+    assert torch.autograd.grad(parts.square().sum(), [sh])[0].equal(gradient)
+
+
+def test_ray_slopes_are_those_of_the_mean_depth_behind_a_pixel():
+    """Depth given the pixel, of the Gaussian of the linear projection's pixel and depth, from all its covariances."""
+    scene, camera = make_scene(1, seed=3, dtype=F64), straight_camera()
+    scene = replace(scene, means=torch.tensor([[0.3, -0.2, 4.0]], dtype=F64))
+    x, y, z = scene.means[0].tolist()
+    across, down = (camera.fx / z, 0, -camera.fx * x / z**2), (0, camera.fy / z, -camera.fy * y / z**2)
+    both = torch.tensor([across, down, (0, 0, 1)], dtype=F64)
+    axes = torch.from_numpy(Rotation.from_quat(scene.quats[0].roll(-1)).as_matrix()) * scene.scales[0]
+    joint = both @ axes @ axes.T @ both.T
+    joint[:2, :2] += 0.3 * torch.eye(2, dtype=F64)
+    splats = with_ray_slopes(project(scene, camera).blurred(0.3, compensate=False), scene, camera)
+    expected = torch.linalg.solve(joint[:2, :2], joint[:2, 2])
+    assert expected.abs().min() > 1e-4
+    torch.testing.assert_close(splats.ray_slopes[0], expected, rtol=1e-9, atol=0)
