@@ -7,7 +7,7 @@ the pixels where that can happen: all others must agree tightly, and those that 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -76,16 +76,25 @@ def test_each_tile_sorts_its_splats_by_their_depth_along_its_middle(rasterize):
     close(image.rgb[4, 16:], torch.tensor([[0.5, 0.25, 0.0]]).expand(8, 3))
 
 
+def gradients(draw: Callable[..., Render], splats: Splats2D, hw: tuple[int, int]) -> tuple[torch.Tensor, ...]:
+    leaves = {name: getattr(splats, name).detach().requires_grad_() for name in ("means", "opacities", "rgb")}
+    image = draw(replace(splats, **leaves), hw, SKY)
+    weights = torch.linspace(0.5, 1.5, image.alpha.numel(), dtype=F64).view(hw)
+    loss = (image.rgb.square().sum(dim=2) * weights + image.alpha * weights.flip(0)).sum()
+    return torch.autograd.grad(loss, [*leaves.values()])
+
+
+def require_gradients(splats: Splats2D, hw: tuple[int, int], tiled: Tiled = TILED, rules: Rules = RULES_3DGS) -> None:
+    """Raise AssertionError unless they are those of the reference."""
+    found, expected = (gradients(partial(draw, rules=rules), splats, hw) for draw in (tiled, REFERENCE))
+    for fast, slow in zip(found, expected, strict=True):
+        assert slow.abs().amax(dim=-1).max() > 0
+        torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-12)
+
+
 def test_gradients_are_those_of_the_order_by_tile():
-    splats, gradients = make_splats(80, (17, 26), seed=4).to(F64), []
-    splats = replace(splats, ray_slopes=2.0 * (splats.means / 7).sin())
-    for draw in (TILED, REFERENCE):
-        values = {name: getattr(splats, name).clone().requires_grad_() for name in ("means", "opacities", "rgb")}
-        image = draw(replace(splats, **values), (17, 26), BLACK)
-        loss = (image.rgb * image.rgb.detach().roll(1, dims=2)).sum()
-        gradients.append(torch.autograd.grad(loss, [*values.values()]))
-    for tiled, exact in zip(*gradients, strict=True):
-        torch.testing.assert_close(tiled, exact, rtol=1e-8, atol=1e-8)
+    splats = make_splats(80, (17, 26), seed=4).to(F64)
+    require_gradients(replace(splats, ray_slopes=2.0 * (splats.means / 7).sin()), (17, 26))
 
 
 @pytest.mark.parametrize(("alpha", "drawn"), [(1.001 / 255, True), (0.999 / 255, False)])
@@ -309,9 +318,6 @@ def test_splats_are_paired_with_exactly_the_tiles_that_their_ellipses_reach():
         assert not listed[surely_missed, tile].any()
 
 
-SKY = (0.25, 0.5, 1.0)
-
-
 class TwoTilesAtOnce(Kernels):
     """Eager kernels that composite two tiles a call."""
 
@@ -329,25 +335,12 @@ def in_tiles(*counts: int) -> Splats2D:
     return replace(splats, means=means, covs=covs, dets=dets, opacities=0.05 + 0.1 * splats.opacities)
 
 
-def gradients(draw, splats: Splats2D, hw: tuple[int, int]) -> tuple[torch.Tensor, ...]:
-    assert splats.rgb is not None
-    leaves = [x.detach().requires_grad_() for x in (splats.means, splats.opacities, splats.rgb)]
-    means, opacities, rgb = leaves
-    image = draw(replace(splats, means=means, opacities=opacities, rgb=rgb), hw, SKY)
-    weights = torch.linspace(0.5, 1.5, image.alpha.numel(), dtype=F64).view(hw)
-    return torch.autograd.grad((image.rgb.sum(dim=2) * weights + image.alpha * weights.flip(0)).sum(), leaves)
-
-
 @pytest.mark.parametrize("kernels", [EAGER, TwoTilesAtOnce()], ids=["all tiles at once", "two at once"])
 @pytest.mark.parametrize(
     "counts", [(7,), (7, 0), (0, 7), (0, 7, 0), (20, 3), (3, 20), (40, 1, 1), (1, 1, 40, 0), (5, 70, 2, 9, 33)], ids=str
 )
 def test_gradients_where_few_tiles_have_splats(counts, kernels):
-    splats, hw = in_tiles(*counts), (TILE, TILE * len(counts))
-    found, expected = (gradients(draw, splats, hw) for draw in (Tiled(kernels), Reference()))
-    for fast, slow in zip(found, expected, strict=True):
-        assert slow.abs().amin(dim=-1).max() > 0
-        torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-12)
+    require_gradients(in_tiles(*counts), (TILE, TILE * len(counts)), Tiled(kernels))
 
 
 def test_gradients_of_what_is_not_drawn_are_0():
@@ -408,8 +401,6 @@ def test_lists_that_are_padded_sort_as_those_that_are_not(count, dtype):
     assert torch.equal(order, expected.indices)
 
 
-BLACK, SKY = (0.0, 0.0, 0.0), (0.25, 0.5, 1.0)
-RED, GREEN = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 OTHERS = {
     "gsplat": RULES_GSPLAT,
     "low cap": Rules(max_alpha=0.6),
@@ -419,8 +410,6 @@ OTHERS = {
     "all": Rules(max_alpha=0.9, min_alpha=0.02, min_transmittance=0.01),
 }
 HW = (20, 27)
-
-
 rules = each(OTHERS)
 
 
@@ -453,13 +442,7 @@ def test_compositors_equal_their_exact_twins_under_other_rules(compositor, rules
 
 
 def test_gradients_follow_the_rules(rules):
-    splats = opaque_splats()
-    found = []
-    for draw in (TILED, REFERENCE):
-        means = splats.means.clone().requires_grad_()
-        image = draw(replace(splats, means=means), HW, BLACK, POINT, None, rules)
-        found.append(torch.autograd.grad(image.rgb.square().sum(), means)[0])
-    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
+    require_gradients(opaque_splats(), HW, rules=rules)
 
 
 def test_any_number_of_channels_is_composited_as_three_are():
@@ -478,8 +461,7 @@ def test_any_number_of_channels_is_composited_as_three_are():
 @pytest.mark.parametrize("rasterizer", ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
 def test_rules_worked_by_hand(rasterizer):
     def centre(*opacities: float, rules: Rules) -> float:
-        layers = [((4.5, 4.5), (4.0, 0.0, 4.0), 1.0 + i, o, RED) for i, o in enumerate(opacities)]
-        splats = splats_of(*layers).to(torch.float32)
+        splats = stack(*((opacity, RED) for opacity in opacities)).to(torch.float32)
         return rasterizer(splats, (16, 16), BLACK, POINT, None, rules).alpha[4, 4].item()
 
     assert centre(1.0, rules=RULES_GSPLAT) == pytest.approx(0.999, abs=1e-6)
