@@ -1,10 +1,11 @@
-"""Nouns are values: they can be compared, hashed, copied and sent to another process."""
+"""Nouns are values: they can be compared, hashed, copied and sent to another process; digests tell their contents."""
 
 import copy
 import math
 import os
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.context import set_spawning_popen
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -15,13 +16,14 @@ from beartype.roar import BeartypeCallHintParamViolation
 from jaxtyping import TypeCheckError
 
 from aaplug import METRICS, RECIPES, CameraSet, Renderer, TrainingViews, look_at
-from aaplug.core.gaussians import Origin
+from aaplug.core.gaussians import Origin, digest_of_scene
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.scenes import read_scene, scene_of, write_scene
-from aaplug.system.errors import UsageError, listing
+from aaplug.system.digests import digest_of_files
+from aaplug.system.errors import FormatError, UsageError, listing
 from aaplug.verbs.render import Written
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
@@ -228,3 +230,78 @@ def test_types_and_shapes_are_checked_in_every_test(test):
         replace(make_splats(6, (8, 8)), depths=torch.zeros(5))
     with pytest.raises(TypeCheckError):
         sh_colour(torch.zeros(6, 4, 3), torch.zeros(5, 3))
+
+
+KNOWN = sized(make_scene(5))
+CHANGES = {
+    "a mean": lambda: replace(KNOWN, means=KNOWN.means + 1e-6),
+    "a 3D filter": lambda: replace(KNOWN, filter_3d=torch.ones(5)),
+    "no extras": lambda: replace(KNOWN, extras={}),
+    "an extra column": lambda: replace(KNOWN, extras={**KNOWN.extras, "base_mask": torch.zeros(5)}),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_scene_is_known_by_all_that_it_is_drawn_by(change):
+    assert digest_of_scene(CHANGES[change]()) != digest_of_scene(KNOWN)
+    assert digest_of_scene(replace(KNOWN, means=KNOWN.means.clone())) == digest_of_scene(KNOWN)
+
+
+@dataclass(frozen=True)
+class Weighted:
+    weights: torch.Tensor
+
+    def __call__(self, splats, camera, training):
+        return splats
+
+
+class Plain:
+    def __init__(self, variance):
+        self.variance = variance
+
+    __call__ = Weighted.__call__
+
+
+def made(variance):
+    def screen(splats, camera, training):
+        return splats.blurred(variance, compensate=True)
+
+    return screen
+
+
+def many(middle):
+    return torch.cat([torch.zeros(5000), torch.tensor([middle]), torch.zeros(5000)]).requires_grad_()
+
+
+SAME_NAMES = {
+    "a function's variable": (made(0.1), made(0.3), made(0.1)),
+    "a lambda's number": (
+        lambda splats, camera, training: splats.blurred(0.1, compensate=True),
+        lambda splats, camera, training: splats.blurred(0.3, compensate=True),
+        lambda splats, camera, training: splats.blurred(0.1, compensate=True),
+    ),
+    "a field": (Plain(0.1), Plain(0.3), Plain(0.1)),
+    "one of many numbers": (Weighted(many(0.0)), Weighted(many(1.0)), Weighted(many(0.0))),
+    "an argument": (partial(made(0.1), training=1), partial(made(0.3), training=1), partial(made(0.1), training=1)),
+}
+
+
+@pytest.mark.parametrize("change", SAME_NAMES)
+def test_a_recipe_is_known_by_what_its_functions_and_objects_hold(change):
+    screen, other, same = (replace(RECIPES["classic"], screen=screen).digest for screen in SAME_NAMES[change])
+    assert screen == same != other
+
+
+def test_a_recipe_is_known_by_what_it_draws_by():
+    """In every process: test_compiled.py starts one."""
+    assert len({recipe.digest for recipe in RECIPES.values()}) == len(RECIPES)
+    auto = RECIPES["auto"]
+    assert replace(auto, when="always").digest == auto.digest
+    assert replace(auto, target_rate=0.6).digest != auto.digest
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "folder").mkdir()
+    for name, problem in (("missing", "no such file or directory"), ("folder", "is a directory")):
+        with pytest.raises(FormatError, match=f"{name}: cannot be read: {problem}"):
+            digest_of_files([tmp_path / name])
