@@ -25,6 +25,7 @@ import torch
 import aaplug
 from aaplug import Monitor, Renderer
 from aaplug.core.kernels import Kernel, Kernels
+from aaplug.evaluation.laws.base import make_camera, make_scene
 from aaplug.io.image_formats import Storage
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.frames import write_frames
@@ -32,16 +33,7 @@ from aaplug.system import groups
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, OutputError, UsageError, within_memory
 from aaplug.system.executors import Processes, ProcessesIfLong, Threads, given_threads, save, torch_threads
-from tests.conftest import (
-    ALL_RASTERIZERS,
-    ROOT,
-    SAMPLE,
-    exit_code,
-    files_of_at_most,
-    make_camera,
-    make_scene,
-    run_python,
-)
+from tests.conftest import ALL_RASTERIZERS, ROOT, SAMPLE, exit_code, files_of_at_most, run_python
 from tests.work import refuse_three
 
 

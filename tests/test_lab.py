@@ -17,6 +17,7 @@ from aaplug import RECIPES, CameraSet, Gaussians, Limits, Monitor, Renderer, Spl
 from aaplug.core.conventions import MIP
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.laws.base import make_camera, make_scene, make_splats
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
@@ -39,17 +40,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
-from tests.conftest import (
-    ALL_RASTERIZERS,
-    ROOT,
-    SAMPLE,
-    make_camera,
-    make_scene,
-    make_splats,
-    run_python,
-    sized,
-    splats_of,
-)
+from tests.conftest import ALL_RASTERIZERS, ROOT, SAMPLE, run_python, sized, splats_of
 
 PROGRAM = """
 import os, sys

@@ -18,6 +18,7 @@ from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules
 from aaplug.core.splats import NEARER, Render, Splats2D
+from aaplug.evaluation.laws.base import make_camera, make_scene, make_splats
 from aaplug.lab.integral import INTEGRAL
 from aaplug.methods import COMPOSITORS, PIXEL_KERNELS
 from aaplug.methods.pixel_kernels.point import POINT
@@ -27,17 +28,7 @@ from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled, binning, forward, rasterizer
 from aaplug.rasterizers.tiled.packages import CompiledKernels
 from aaplug.system.executors import torch_threads
-from tests.conftest import (
-    ALL_RASTERIZERS,
-    COMPILED,
-    each,
-    make_camera,
-    make_scene,
-    make_splats,
-    memory_taken,
-    needs_peak_memory,
-    splats_of,
-)
+from tests.conftest import ALL_RASTERIZERS, COMPILED, each, memory_taken, needs_peak_memory, splats_of
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
