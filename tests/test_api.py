@@ -77,15 +77,12 @@ def test_verbs_have_the_options_of_the_command_line(verb):
         assert not keyword or parameter.default is not inspect.Parameter.empty, name
 
 
-def test_the_version_and_every_folder_of_the_library_are_packaged():
+def test_the_version_every_folder_of_the_library_and_a_small_sample_with_its_origin_are_packaged():
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert aaplug.__version__ == stated["project"]["version"]
     listed = stated["tool"]["setuptools"]["packages"]
     folders = {".".join(file.parent.relative_to(ROOT).parts) for file in ROOT.glob("aaplug/**/__init__.py")}
     assert set(listed) == folders | {"aaplug_cli", "aaplug_cli.guides"}
-
-
-def test_the_sample_is_small_and_tells_its_origin():
     files = [path for path in SAMPLE.rglob("*") if path.suffix in {".ply", ".json", ".png", ".md"}]
     assert sum(path.stat().st_size for path in files) < 6e6
     assert "CC0" in (SAMPLE / "ORIGIN.md").read_text()

@@ -528,11 +528,6 @@ def test_a_bundle_serves_every_python_and_every_build_of_its_torch(monkeypatch):
     assert not {*before.values()} & {*bundled().values()}
 
 
-def test_a_compiler_that_does_not_run_has_no_version():
-    assert compiled._compiler_version("no-such-compiler") == ""
-    assert compiled._compiler_version(sys.executable).startswith("Python 3.")
-
-
 def test_names_of_packages_and_digests_of_recipes_are_the_same_in_every_process():
     """Also where annotations of arrays are not checked, as in the user's process."""
     program = (
@@ -665,6 +660,8 @@ def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
     monkeypatch.setenv("CXX", "g++-99")
     with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler .* g\+\+-99 is not here"):
         compiled.build()
+    assert compiled._compiler_version("no-such-compiler") == ""
+    assert compiled._compiler_version(sys.executable).startswith("Python 3.")
 
 
 @pytest.fixture

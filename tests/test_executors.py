@@ -312,9 +312,6 @@ def test_a_program_that_ends_does_not_wait_for_its_workers():
 def test_lack_of_memory_is_one_clear_error(error):
     with pytest.raises(UsageError, match="view r_0: out of memory; a smaller `scale`"), within_memory("view r_0"):
         raise error
-
-
-def test_other_errors_are_not_taken_for_lack_of_memory():
     with pytest.raises(RuntimeError, match="shape"), within_memory("view r_0"):
         raise RuntimeError("shape '[2]' is invalid for input of size 3")
 

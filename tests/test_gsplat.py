@@ -563,10 +563,12 @@ LIKE_DEFAULTS = {  # values that ask for what gsplat does by default
 }  # fmt: skip
 
 
-def test_arguments_that_ask_for_the_default_are_taken():
+def test_arguments_that_ask_for_the_default_are_taken_and_depth_needs_no_colours():
     values, views = gaussians(), two_views()
     expected, _, _ = rasterization(**values, **views)
     assert rasterization(**values, **views, **LIKE_DEFAULTS)[0].equal(expected)
+    depth, _, _ = rasterization(**values, **views, render_mode="ED")  # needs no colours
+    assert rasterization(**values | {"colors": None}, **views, sh_degree=1, render_mode="ED")[0].equal(depth)
 
 
 @pytest.mark.parametrize("function", [rasterization, rasterization_2dgs])
@@ -575,12 +577,6 @@ def test_autocast_changes_nothing(function):
     expected, *_ = function(**values, **views, sh_degree=1, render_mode="RGB+ED")
     with torch.autocast("cpu"):
         assert function(**values, **views, sh_degree=1, render_mode="RGB+ED")[0].equal(expected)
-
-
-def test_depth_needs_no_colours():
-    values, views = gaussians(degree=1), two_views()
-    expected, _, _ = rasterization(**values, **views, sh_degree=1, render_mode="ED")
-    assert rasterization(**values | {"colors": None}, **views, sh_degree=1, render_mode="ED")[0].equal(expected)
 
 
 # ---------------------------------------------------------------------------------------------------------- gradients

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from aaplug import RECIPES, CameraSet, Gaussians, Limits, Monitor, Renderer, Splats2D, UsageError, finetune, lod, merge
 from aaplug.core.conventions import MIP
@@ -26,7 +25,6 @@ from aaplug.lab.gaussian_blending import (
     MAX_POINT_SPAN,
     MIN_WINDOW_VARIANCE,
     GaussianBlending,
-    Light,
     behind,
     light_of,
     moments,
@@ -280,7 +278,7 @@ def test_moments_are_integrals(u, half, dtype, near):
     assert found.centre.item() == pytest.approx(math.exp(-0.5 * u * u), rel=near)
 
 
-def after(*splats: tuple, window: float = 1.0, dtype: torch.dtype = F64) -> tuple[Light, Tensor]:
+def after(*splats: tuple, window: float = 1.0, dtype: torch.dtype = F64):
     """The light behind splats at the pixel whose centre is the origin, and their raster rows."""
     rows = BLENDING.rows(replace(splats_of(*splats).to(dtype), window=window))
     origin = torch.zeros(1, 1, dtype=dtype)

@@ -195,7 +195,10 @@ def test_a_lens_ends_where_its_radial_map_turns_back():
     assert far[1, 0] > far[0, 0]
 
 
-def test_a_hollow_lens_is_refused():
+def test_a_hollow_lens_is_refused_and_any_by_discs():
+    renderer = Renderer.of(make_scene(10), [make_camera((0.0, -4.0, 0.0))], "2dgs")
+    with pytest.raises(UsageError, match="recipe 2dgs draws pinhole views only"):
+        renderer(view_through(EQUIDISTANT))
     with pytest.raises(UsageError, match="leaves no image"):
         opencv_lens((-1e9,)).places(torch.ones(1, 3))
     with pytest.raises(UsageError, match="equirect projection has no distortion"):
@@ -309,13 +312,6 @@ def test_a_panorama_has_neither_seam_nor_pole():
     expected = cv2.remap(image.numpy(), (x % 192).numpy(), y.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     error = (torch.from_numpy(expected) - rolled)[8:-8].square().mean().sqrt()
     assert error < 0.02  # interpolation
-
-
-def test_a_recipe_of_discs_says_that_it_has_no_lens():
-    scene = make_scene(10)
-    renderer = Renderer.of(scene, [make_camera((0.0, -4.0, 0.0))], "2dgs")
-    with pytest.raises(UsageError, match="recipe 2dgs draws pinhole views only"):
-        renderer(view_through(EQUIDISTANT))
 
 
 def test_a_renderer_of_another_process_draws_through_a_lens():

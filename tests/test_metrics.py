@@ -16,12 +16,6 @@ from aaplug.evaluation.metrics import SSIM, default_metrics, energy_drift, find_
 from aaplug.system.registry import spelt
 
 
-def test_psnr_of_a_constant_error_and_of_none():
-    truth = torch.zeros(4, 4, 3)
-    assert psnr(truth + 0.1, truth) == pytest.approx(20.0, abs=1e-5)
-    assert psnr(truth, truth) is None
-
-
 @pytest.mark.parametrize("hw", [(11, 11), (40, 32), (97, 130)])
 @pytest.mark.parametrize(("flavour", "border"), [("wang", 0), ("3dgs", 5)])
 def test_ssim_is_the_one_of_wang_with_the_border_cropped_or_padded(hw, flavour, border):
@@ -38,13 +32,12 @@ def test_ssim_is_the_one_of_wang_with_the_border_cropped_or_padded(hw, flavour, 
     assert ssim(a, b, flavour) == pytest.approx(expected.mean().item(), abs=1e-9)
 
 
-def test_energy_drift_is_the_share_of_light_gained():
-    image = torch.rand(8, 8, 3)
+def test_metrics_worked_by_hand():
+    """PSNR of a constant error, energy drift as the share of light gained, flicker of motion alone and of twice it."""
+    image, black = torch.rand(8, 8, 3), torch.zeros(8, 8, 3)
+    assert psnr(black + 0.1, black) == pytest.approx(20.0, abs=1e-5)
     assert energy_drift(1.25 * image, image) == pytest.approx(0.25)
-    assert energy_drift(image, torch.zeros(8, 8, 3)) is None
-
-
-def test_flicker_of_motion_alone_is_one_and_of_twice_the_change_two():
+    assert (psnr(black, black), energy_drift(image, black)) == (None, None)
     frames = [torch.full((4, 4, 3), value) for value in (0.1, 0.2, 0.15)]
     assert flicker(frames, frames) == pytest.approx(1.0)
     assert flicker([2 * frame for frame in frames], frames) == pytest.approx(2.0)
@@ -79,14 +72,11 @@ def test_a_metric_is_ideal_or_undefined_for_equal_images(comparing, name, hw):
     assert value == (None if undefined else pytest.approx(metric.ideal, abs=1e-6))
 
 
-def test_a_metric_gives_one_number_of_any_type():
+def test_a_metric_gives_one_number_of_any_type_and_is_of_one_kind():
     square, image = partial(Metric, "square", "", 0.0, 2, ""), torch.full((4, 4, 3), 0.5)
     assert type(square(measure=lambda a, b: (a * b).mean()).compare(image, image)) is float
     with pytest.raises(UsageError, match="metric square: gives no number but Tensor"):
         square(measure=lambda a, b: a * b).compare(image, image)
-
-
-def test_a_metric_of_neither_kind_is_refused():
     with pytest.raises(UsageError, match="needs either `measure` or `figure`"):
         Metric("nothing", "", 1.0, 2, "neither")
     with pytest.raises(UsageError, match="digits: expected an integer from 0, got -1"):

@@ -67,9 +67,6 @@ def test_a_printed_scene_says_what_it_is_and_leaves_out_what_its_writer_needs(tm
         assert "scene.ply" in printed
         assert "convention=" in printed
         assert "f_dc_0" not in printed
-
-
-def test_a_printed_registry_lists_its_names():
     assert repr(METRICS).startswith("Registry(metric: PSNR, SSIM, LPIPS")
 
 

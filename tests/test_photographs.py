@@ -40,7 +40,7 @@ def test_box_composites_rounds_and_averages(rgba):
     assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), (0.25, 0.25)).equal(expected)
 
 
-def test_rgba_box_averages_straight_alpha_and_cuts_twice(rgba):
+def test_rgba_box_averages_straight_alpha_cuts_twice_and_refuses_what_is_not_halved(rgba):
     bgra = cv2.imread(str(rgba), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]].astype(np.float64) / 255
     small = bgra.reshape(4, 4, 6, 4, 4).mean(axis=(1, 3))
     saved = np.floor(small * 255 + 1e-6) / 255
@@ -48,9 +48,6 @@ def test_rgba_box_averages_straight_alpha_and_cuts_twice(rgba):
     found = DOWNSCALES["rgba-box"].read(rgba, WHITE).at((4, 6), (0.25, 0.25))
     levels = np.floor(composited * 255 + 1e-3)
     assert np.abs((found * 255).round().numpy() - levels).max() == 0
-
-
-def test_rgba_box_refuses_what_is_not_halved(rgba):
     with pytest.raises(UsageError, match="power of 1/2"):
         DOWNSCALES["rgba-box"].read(rgba, WHITE).at((5, 8), (1 / 3, 1 / 3))
 
