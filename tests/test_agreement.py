@@ -40,11 +40,6 @@ def test_photographs_tell_a_scene_from_one_turned_over(few, sample_cameras):
     assert str(wrong).endswith(f"{-wrong.gain:.1f} dB farther from photographs than a flat colour")
 
 
-def shrunk(pose: torch.Tensor) -> torch.Tensor:
-    """The pose in a world of a hundredth of the size."""
-    return torch.cat([pose[:, :3], pose[:, 3:] * pose.new_tensor([[0.01], [0.01], [0.01], [1]])], dim=1)
-
-
 def test_without_photographs_cameras_should_look_at_the_scenes_middle():
     scene = make_scene(200)
     towards = [make_camera((0.3 * i - 1, -4.0, 0.0)) for i in range(5)]
@@ -54,7 +49,9 @@ def test_without_photographs_cameras_should_look_at_the_scenes_middle():
     aside = [replace(camera, cx=camera.cx + 0.6 * camera.width) for camera in towards]
     found = fit_of(scene, CameraSet(tuple(aside), tuple(aside)))
     assert "the middle of the scene lies outside of the image" in found.doubt
-    near = [replace(camera, cam_from_world=shrunk(camera.cam_from_world)) for camera in towards]
+    hundredth = torch.ones(4, 4)
+    hundredth[:3, 3] = 0.01  # of the world's size
+    near = [replace(camera, cam_from_world=camera.cam_from_world * hundredth) for camera in towards]
     found = fit_of(replace(scene, means=scene.means / 100), CameraSet(tuple(near), tuple(near)))
     assert "no Gaussian lies farther ahead than 0.2 units" in found.doubt
 

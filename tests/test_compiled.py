@@ -346,14 +346,6 @@ def test_drawing_writes_nothing_and_a_killed_process_leaves_nothing(built, tmp_p
     assert not [*tmp_path.iterdir()]
 
 
-def not_a_package(package: Path) -> None:
-    package.write_bytes(b"not a package")
-
-
-def of_another_kernel(package: Path) -> None:
-    shutil.copy(CACHE / compiled.package_path(binning.PAIRS).name, package)
-
-
 def of_another_machine(package: Path) -> None:
     with zipfile.ZipFile(package) as members:
         [name] = [name for name in members.namelist() if name.endswith(".so")]
@@ -363,14 +355,18 @@ def of_another_machine(package: Path) -> None:
         members.writestr(name, bytes(library))
 
 
-def cut(package: Path) -> None:
-    package.write_bytes(package.read_bytes()[:100_000])
+DAMAGES = {
+    "no package": lambda package: package.write_bytes(b"not a package"),
+    "of another kernel": lambda package: shutil.copy(CACHE / compiled.package_path(binning.PAIRS).name, package),
+    "of another machine": of_another_machine,
+    "cut": lambda package: package.write_bytes(package.read_bytes()[:100_000]),
+}
 
 
-@pytest.mark.parametrize("damage", [not_a_package, of_another_kernel, of_another_machine, cut])
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_or_foreign_package_is_left_aside_with_one_line(copied_cache, damage, caplog):
     package = compiled.package_path(compiled.KERNELS[0])
-    damage(package)
+    DAMAGES[damage](package)
     for _ in range(2):
         assert find_rasterizer("auto") is RASTERIZERS["eager"]
     assert len(caplog.messages) == 1

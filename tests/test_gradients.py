@@ -4,6 +4,7 @@ The laws of pixel kernels compare them with the reference's, and those of filter
 """
 
 from dataclasses import replace
+from operator import attrgetter
 
 import pytest
 import torch
@@ -25,21 +26,11 @@ TRAINING = TrainingViews.of(SCENE, [CAMERA, make_camera((2.0, -3.0, 1.0), size=(
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "pose")
 
 
-def arguments(recipe: Recipe) -> tuple[object, ...]:
-    """Everything that makes an image."""
-    return (
-        *(recipe.world, recipe.screen, recipe.pixel, recipe.compositor, recipe.selection),
-        *(recipe.grid, recipe.target_rate, recipe.neighbours),
-    )
-
-
+arguments = attrgetter(  # of a recipe: everything that makes an image
+    "world", "screen", "pixel", "compositor", "selection", "grid", "target_rate", "neighbours"
+)
 NAMED = {**RECIPES, "samples": replace(RECIPES["sa-gs"], target_rate=1.0)}
 DIFFERENT = {arguments(recipe): name for name, recipe in NAMED.items()}  # one name where several are alike
-
-
-def leaves() -> dict[str, Tensor]:
-    values = {name: getattr(SCENE, name) for name in NAMES[:-1]} | {"pose": VIEW.cam_from_world}
-    return {name: value.clone().requires_grad_() for name, value in values.items()}
 
 
 def loss(recipe: Recipe, values: dict[str, Tensor]) -> Tensor:
@@ -66,9 +57,9 @@ def direction(name: str, like: Tensor) -> Tensor:
 @pytest.mark.parametrize("recipe", DIFFERENT.values())
 def test_gradients_are_finite_differences(recipe):
     """In one direction, in which the image changes as much by every leaf: an error of any of them shows."""
-    chosen, values = NAMED[recipe], leaves()
+    chosen, fixed = NAMED[recipe], {name: getattr(SCENE, name) for name in NAMES[:-1]} | {"pose": VIEW.cam_from_world}
+    values = {name: value.clone().requires_grad_() for name, value in fixed.items()}
     grads = torch.autograd.grad(loss(chosen, values), list(values.values()))
-    fixed = {name: value.detach() for name, value in values.items()}
     directions = {name: direction(name, value) for name, value in fixed.items()}
     slopes = {name: (grad * directions[name]).sum().item() for name, grad in zip(NAMES, grads, strict=True)}
     least = min(abs(slope) for slope in slopes.values())

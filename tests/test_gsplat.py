@@ -106,16 +106,6 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     return factor @ factor.mT
 
 
-def projected_by(
-    reference, values: dict[str, Tensor], views: dict[str, object], model: str = "pinhole"
-) -> tuple[Tensor, ...]:
-    """Radii, means, depths, conics and compensation by gsplat, [c, n, ...]."""
-    sigma = values["covars"] if "covars" in values else covariances(values["quats"], values["scales"])
-    tensors = values["means"], sigma, views["viewmats"], views["Ks"]
-    words = {"calc_compensations": True, "camera_model": model}
-    return reference._fully_fused_projection(*tensors, views["width"], views["height"], **words)
-
-
 def opaque(given: str) -> dict[str, Tensor]:
     """Opaque Gaussians whose shapes are given as scales or as `covars`."""
     values = gaussians(50) | {"opacities": torch.ones(50, dtype=F64)}
@@ -137,7 +127,11 @@ def test_projection_equals_gsplats_on_a_thousand_cases(reference, model, given):
         views["viewmats"][:, :3, 3] *= WORLD
     if model == "ortho":
         views["Ks"][:, [0, 1], [0, 1]] /= 3 * WORLD
-    radii, means, depths, conics, factors = projected_by(reference, values, views, model)
+    sigma = values["covars"] if given == "covars" else covariances(values["quats"], values["scales"])
+    words = {"calc_compensations": True, "camera_model": model}
+    radii, means, depths, conics, factors = reference._fully_fused_projection(
+        values["means"], sigma, *views.values(), **words
+    )
     for dtype, px, relative in ((torch.float32, 1e-4, 1e-5), (F64, 1e-9, 1e-9)):
         ours = {name: x.to(dtype) if isinstance(x, Tensor) else x for name, x in (values | views).items()}
         words = {"packed": False, "rasterize_mode": "antialiased", "camera_model": model, "rasterizer": Nothing()}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug import RULES_3DGS, Camera, Gaussians, Renderer, TrainingViews, UsageError
+from aaplug import RULES_3DGS, Camera, Renderer, TrainingViews, UsageError
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
 from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.io.lenses import Distortion, undistorted, with_lenses
@@ -264,15 +264,11 @@ def test_tiles_draw_through_a_lens_what_the_reference_does(lens):
         assert error.mean() < 1e-6, name
 
 
-def big_and_small(n: int = 400) -> Gaussians:
-    scene = make_scene(n, dtype=torch.float64)
-    sizes = torch.linspace(-5.0, 1.0, n, dtype=torch.float64)[:, None]
-    return replace(scene, log_scales=scene.log_scales - scene.log_scales.mean(dim=1, keepdim=True) + sizes)
-
-
 def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
     camera = view_through(lens, side=96)
-    splats = project(big_and_small(200), camera).blurred(0.3, compensate=False)
+    scene, sizes = make_scene(200, dtype=torch.float64), torch.linspace(-5.0, 1.0, 200, dtype=torch.float64)[:, None]
+    scene = replace(scene, log_scales=scene.log_scales - scene.log_scales.mean(dim=1, keepdim=True) + sizes)
+    splats = project(scene, camera).blurred(0.3, compensate=False)
     ellipses = RAY.bounding_ellipses(splats, RULES_3DGS)
     assert ellipses is not None
     y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in camera.hw), indexing="ij")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import aaplug
-from aaplug import Gaussians, Lens, Renderer, Splats2D, UsageError, write_scene
+from aaplug import Gaussians, Lens, Renderer, UsageError, write_scene
 from aaplug.core.passes import PASSES
 from aaplug.io.image_formats import IMAGE_FORMATS, PNG
 from aaplug.methods.order import Order
@@ -90,7 +90,9 @@ GROUPS = [("nearest", "median", "number", "weight"), ("count", "weight", "number
 @pytest.mark.parametrize("kernel", aaplug.PIXEL_KERNELS)
 @pytest.mark.parametrize("shown", GROUPS)
 def test_the_order_of_splats_agrees_with_its_float64_twin(kernel, shown):
-    pixel, splats = aaplug.PIXEL_KERNELS[kernel], numbered(make_splats(160, (28, 37)).to(torch.float64))
+    pixel, splats = aaplug.PIXEL_KERNELS[kernel], make_splats(160, (28, 37)).to(torch.float64)
+    depth_and_number = torch.stack([splats.depths, torch.arange(160.0), torch.zeros(160)], dim=1)
+    splats = replace(splats, rgb=depth_and_number, depth_slopes=torch.zeros_like(splats.means))
     order = Order.of(pixel, shown, splats)
     fast, exact = (draw(splats, (28, 37), BLACK, pixel, order) for draw in (EAGER_TILED, REFERENCE))
     for name, a, b in zip(shown, (*fast.rgb.unbind(2), fast.alpha), (*exact.rgb.unbind(2), exact.alpha), strict=True):
@@ -98,13 +100,6 @@ def test_the_order_of_splats_agrees_with_its_float64_twin(kernel, shown):
         assert len(a.unique()) > 10
     half = EAGER_TILED(splats.to(torch.float32), (28, 37), BLACK, pixel, order)
     assert (half.rgb[..., 2].double() - exact.rgb[..., 2]).abs().lt(1e-4).double().mean() > 0.999
-
-
-def numbered(splats: Splats2D) -> Splats2D:
-    """Splats whose colour is their depth and number."""
-    numbers = torch.arange(len(splats)).to(splats.depths)
-    slopes = splats.depth_slopes if splats.depth_slopes is not None else torch.zeros_like(splats.means)
-    return replace(splats, rgb=torch.stack([splats.depths, numbers, 0 * numbers], dim=1), depth_slopes=slopes)
 
 
 def test_each_pass_resolves_the_samples_of_a_pixel_by_its_rule():
