@@ -7,7 +7,7 @@ import csv
 import re
 from collections.abc import Callable
 from statistics import fmean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tests.bench.method_tables import PSNR_COLUMN, SCALES, TABLES, made, table
 
@@ -15,14 +15,15 @@ PAGE = TABLES.with_name("claims.md")
 
 
 class Ours(NamedTuple):
-    """A figure that aaplug measured, and the result file that it is read from."""
+    """A figure that aaplug measured: the result file that it is read from, and how, in words."""
 
     file: str
-    read: Callable[[], str]
+    read: Callable[..., str]
+    args: tuple[Any, ...]
 
     def __call__(self) -> str:
         """The figure, in words."""
-        return self.read()
+        return self.read(self.file, *self.args)
 
 
 class Claim(NamedTuple):
@@ -43,75 +44,64 @@ def value(scene: str, recipe: str, scale: float, column: str = PSNR_COLUMN) -> f
     return float(table(scene)[recipe, scale][column])
 
 
-def _over(scene: str, recipe: str, scales: tuple[float, ...]) -> Ours:
+def _over(scene: str, recipe: str, scales: tuple[float, ...]) -> str:
     """PSNR at some scales and their mean."""
-
-    def text() -> str:
-        values = [value(scene, recipe, scale) for scale in scales]
-        return f"{' '.join(f'{value:.2f}' for value in values)}, mean {fmean(values):.2f} dB"
-
-    return Ours(scene, text)
+    values = [value(scene, recipe, scale) for scale in scales]
+    return f"{' '.join(f'{value:.2f}' for value in values)}, mean {fmean(values):.2f} dB"
 
 
-def _gain(scene: str, recipe: str, other: str, scales: tuple[float, ...]) -> Ours:
+def _gain(scene: str, recipe: str, other: str, scales: tuple[float, ...]) -> str:
     """Mean gain in PSNR of one recipe over another."""
-    return Ours(scene, lambda: f"{fmean(value(scene, recipe, s) - value(scene, other, s) for s in scales):+.2f} dB")
+    return f"{fmean(value(scene, recipe, s) - value(scene, other, s) for s in scales):+.2f} dB"
 
 
-def _fall(scene: str, recipe: str, first: float, last: float) -> Ours:
-    return Ours(scene, lambda: f"{value(scene, recipe, first):.2f} → {value(scene, recipe, last):.2f} dB")
+def _fall(scene: str, recipe: str, first: float, last: float) -> str:
+    return f"{value(scene, recipe, first):.2f} → {value(scene, recipe, last):.2f} dB"
 
 
-def _time(rasterizer: str, recipe: str) -> Ours:
+def _time(name: str, rasterizer: str, recipe: str) -> str:
     """How much longer a view takes than by `classic`, in percent."""
-
-    def text() -> str:
-        with open(TABLES / "times.csv", newline="", encoding="utf-8") as file:
-            times = {(line["rasterizer"], line["recipe"]): float(line["ms"]) for line in csv.DictReader(file)}
-        return f"{100 * (times[rasterizer, recipe] / times[rasterizer, 'classic'] - 1):+.0f} % time per view at 1"
-
-    return Ours("times", text)
+    with open(TABLES / f"{name}.csv", newline="", encoding="utf-8") as file:
+        times = {(line["rasterizer"], line["recipe"]): float(line["ms"]) for line in csv.DictReader(file)}
+    return f"{100 * (times[rasterizer, recipe] / times[rasterizer, 'classic'] - 1):+.0f} % time per view at 1"
 
 
-def _work(scene: str, recipe: str, other: str, scale: float) -> Ours:
+def _work(scene: str, recipe: str, other: str, scale: float) -> str:
     """Evaluations of one recipe against another's."""
-
-    def text() -> str:
-        work = [value(scene, name, scale, "evaluations (M)") for name in (recipe, other)]
-        return f"{work[0] / work[1]:.2f} times the evaluations of {other} at {scale:g}"
-
-    return Ours(scene, text)
+    work = [value(scene, name, scale, "evaluations (M)") for name in (recipe, other)]
+    return f"{work[0] / work[1]:.2f} times the evaluations of {other} at {scale:g}"
 
 
 ALL, SMALL, LARGE, NEAR = (1.0, 0.5, 0.25, 0.125), (0.5, 0.25, 0.125), (2.0, 4.0, 8.0), (1.0, 2.0, 4.0, 8.0)
-FIGURES = {  # by the numbers of their rows
-    1: _over("chair", "classic", ALL),
-    2: _fall("chair-eighth", "classic", 1.0, 8.0),
-    3: _fall("snowmiku-quarter", "classic", 1.0, 4.0),
-    4: _over("chair", "ewa", ALL),
-    5: _over("chair", "mip-splatting", ALL),
-    6: _gain("chair", "mip-splatting", "classic", ALL),
-    7: _over("chair", "mip", ALL),
-    8: _over("chair-eighth", "mip-splatting", NEAR),
-    9: _over("chair-eighth", "ewa", NEAR),
-    11: _gain("chair", "sa-gs", "classic", SMALL),
-    12: _gain("snowmiku", "sa-gs", "classic", SMALL),
-    13: _gain("chair-eighth", "sa-gs", "classic", LARGE),
-    14: _gain("chair", "sa-gs-integral", "sa-gs", SMALL),
-    15: _gain("chair", "sa-gs-samples", "sa-gs", SMALL),
-    16: _gain("chair", "auto", "classic", SMALL),
-    17: _gain("chair-eighth", "matched", "classic", LARGE),
-    18: _over("chair", "analytic", ALL),
-    19: _time("eager", "analytic"),
-    20: _over("chair", "gaussian-blending", ALL),
-    21: _gain("chair", "gaussian-blending", "mip-splatting", ALL),
-    22: _over("chair", "aaa", ALL),
-    23: _over("chair", "2dgs", ALL),
-    24: _over("chair", "aa-2dgs", ALL),
-    26: _work("chair", "auto", "classic", 0.125),
-    29: _work("chair", "matched", "classic", 0.125),
-    30: _time("compiled", "matched"),
+READ_FROM = {  # by the numbers of their rows
+    1: (_over, "chair", "classic", ALL),
+    2: (_fall, "chair-eighth", "classic", 1.0, 8.0),
+    3: (_fall, "snowmiku-quarter", "classic", 1.0, 4.0),
+    4: (_over, "chair", "ewa", ALL),
+    5: (_over, "chair", "mip-splatting", ALL),
+    6: (_gain, "chair", "mip-splatting", "classic", ALL),
+    7: (_over, "chair", "mip", ALL),
+    8: (_over, "chair-eighth", "mip-splatting", NEAR),
+    9: (_over, "chair-eighth", "ewa", NEAR),
+    11: (_gain, "chair", "sa-gs", "classic", SMALL),
+    12: (_gain, "snowmiku", "sa-gs", "classic", SMALL),
+    13: (_gain, "chair-eighth", "sa-gs", "classic", LARGE),
+    14: (_gain, "chair", "sa-gs-integral", "sa-gs", SMALL),
+    15: (_gain, "chair", "sa-gs-samples", "sa-gs", SMALL),
+    16: (_gain, "chair", "auto", "classic", SMALL),
+    17: (_gain, "chair-eighth", "matched", "classic", LARGE),
+    18: (_over, "chair", "analytic", ALL),
+    19: (_time, "times", "eager", "analytic"),
+    20: (_over, "chair", "gaussian-blending", ALL),
+    21: (_gain, "chair", "gaussian-blending", "mip-splatting", ALL),
+    22: (_over, "chair", "aaa", ALL),
+    23: (_over, "chair", "2dgs", ALL),
+    24: (_over, "chair", "aa-2dgs", ALL),
+    26: (_work, "chair", "auto", "classic", 0.125),
+    29: (_work, "chair", "matched", "classic", 0.125),
+    30: (_time, "times", "compiled", "matched"),
 }
+FIGURES = {row: Ours(file, read, tuple(args)) for row, (read, file, *args) in READ_FROM.items()}
 ROW = re.compile(r"^\| (\d+) \| (.+?) \| (.+?) \| (.+?) \|.*\|$", re.M)
 SOURCES = re.compile(r"(?<=result files, which )`.*?(?= \(the least of)", re.S)
 CLAIMS = [Claim(*words, ours=FIGURES.get(int(words[0]))) for words in ROW.findall(PAGE.read_text())]

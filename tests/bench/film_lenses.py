@@ -1,8 +1,7 @@
-"""Lenses against pinholes and against rays: panoramas, fisheyes and distorted views, in dB and in time."""
+"""Lenses against pinholes and against rays: panoramas, fisheyes and distorted views, in dB."""
 
 import math
 from dataclasses import replace
-from functools import partial
 from statistics import median
 
 import cv2
@@ -16,7 +15,7 @@ from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, opencv_lens
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.shading import shade
 from aaplug.methods.filters.matched import BY_GLOBAL_RATE
-from tests.bench import heading, row, timed
+from tests.bench import heading, row
 from tests.bench.room import inside, matrices, room, turned
 from tests.conftest import SAMPLE
 
@@ -24,7 +23,6 @@ WIDTH = 4096  # px, of the panorama
 SMALLER = 4  # times: both images are averaged before they are compared
 OPENCV = opencv_lens((-0.12, 0.03, 0.001, -0.002))
 PIXELS_AT_ONCE = 1024  # of the reference by rays
-REPEATS = 5
 
 
 def panorama(pose: Float[Tensor, "4 4"], width: int = WIDTH) -> Camera:
@@ -193,8 +191,3 @@ def main(width: int = WIDTH) -> None:
     for view in views.test[:2]:
         bent = distorted(Renderer.of(chair, views, "matched"), view)
         row(f"chair {view.name}: OPENCV lens against the straight view, dB", bent, 45.0)
-    renderer, view = Renderer.of(chair, views, "classic", rasterizer="compiled"), views.test[0]
-    around = panorama(view.cam_from_world, width)
-    times = timed({camera.name: partial(renderer, camera) for camera in (view, around)}, REPEATS)
-    share = times[around.name] / times[view.name] * view.width * view.height / (around.width * around.height)
-    row("chair: time per pixel of a panorama over a pinhole view", share, 3.0)

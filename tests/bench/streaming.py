@@ -12,11 +12,11 @@ The first row has the change of the scene's own frames.  It is the motion itself
 
 import json
 import math
-import statistics
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -114,7 +114,8 @@ def main(
         for label, (folder, file, how) in shown.items():
             pictures = work / f"{name}-{len(label)}"
             drawn = shoot(PAGES[name], folder, file, how, sized | dict(enumerate(out)), pictures)
-            cells = [_mean([(drawn[v.name, s], _boxed(truths[v.name], s)) for v in seen]) for s in SCALES]
+            averaged = {(v.name, s): quantised(resampled(truths[v.name], s)) for v in seen for s in SCALES}
+            cells = [fmean(decibels(drawn[v.name, s], averaged[v.name, s]) for v in seen) for s in SCALES]
             moving = [drawn[t] for t in range(frames)]
             errors = [image - truth for image, truth in zip(moving, own, strict=True)]
             row(name, label, *cells, _largest_change(moving), _largest_change(errors))
@@ -140,14 +141,6 @@ def _options(name: StreamName, settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**engine, "component": component, "distancePerPixel": distance}
 
 
-def _boxed(image: Float[Tensor, "h w 3"], scale: float) -> Float[Tensor, "h w 3"]:
-    return quantised(resampled(image, scale))
-
-
 def _largest_change(frames: Sequence[Float[Tensor, "h w 3"]]) -> float:
     """Root mean square between two frames in turn, in steps of 8 bits; NaN without two."""
     return max((float((b - a).square().mean().sqrt()) * 255 for a, b in pairwise(frames)), default=math.nan)
-
-
-def _mean(pairs: Sequence[tuple[Tensor, Tensor]]) -> float:
-    return statistics.fmean(decibels(image, truth) for image, truth in pairs)
