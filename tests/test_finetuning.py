@@ -98,9 +98,6 @@ def test_a_scene_for_several_rules_is_measured_by_each():
         assert figure.values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
 
-# losses
-
-
 def test_ssim_is_skimages():
     a, b = torch.rand(2, 30, 41, 3, dtype=F64)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -142,9 +139,6 @@ def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
     assert torch.autograd.gradcheck(total, moving, rtol=1e-4, atol=1e-9, fast_mode=True)
     for name, grad in zip(leaves, torch.autograd.grad(total(*moving), moving), strict=True):
         assert grad.norm() > 1e-6, f"{name} does not matter here"
-
-
-# what moves, and how far
 
 
 def test_steps_lower_the_loss_at_every_scale():
@@ -200,9 +194,6 @@ def test_no_step_leaves_a_gaussian_thinner_than_its_bound():
         held += int((state.leaves["log_scales"] == bound).sum())
         assert (state.leaves["log_scales"] >= bound).all()
     assert held > 10
-
-
-# densification
 
 
 def test_densify_clones_the_small_splits_the_large_and_prunes_the_faint():
@@ -285,9 +276,6 @@ def test_groups_are_drawn_by_opacity():
     group = drawn(opacities, 0.3, torch.Generator().manual_seed(1))
     assert len(group.unique()) == 300
     assert 230 < int((group < 500).sum()) < 290  # 300 draws with replacement would hit them 270 times
-
-
-# runs
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,8 @@ def both(path: Path, recipe: str, drop_bad: bool = False) -> tuple[Renderer, Ren
     return Renderer.of(read, VIEWS, recipe), Renderer.of(held.gaussians(), VIEWS, recipe)
 
 
-@pytest.mark.usefixtures("in_chunks")
 @pytest.mark.parametrize("recipe", ["classic", "auto", "mip-splatting"])
-def test_images_are_the_same_to_the_bit(tmp_path: Path, recipe: str):
+def test_images_are_the_same_to_the_bit(in_chunks, tmp_path: Path, recipe: str):
     read, held = both(written(tmp_path)[0], recipe)
     assert read.scene.sh.shape == held.scene.sh.shape
     assert read.scene.sh.isnan().all()
@@ -58,8 +57,7 @@ def test_images_are_the_same_to_the_bit(tmp_path: Path, recipe: str):
         assert torch.equal(read.trained_at(2.0)(view).rgb, held.trained_at(2.0)(view).rgb)
 
 
-@pytest.mark.usefixtures("in_chunks")
-def test_rows_that_are_left_out_shift_no_colours(tmp_path: Path):
+def test_rows_that_are_left_out_shift_no_colours(in_chunks, tmp_path: Path):
     path, _ = written(tmp_path)
     spoiled = PlyData.read(path, mmap=False)
     spoiled["vertex"]["f_rest_21"][[0, 5, 1999]] = math.inf
@@ -71,8 +69,7 @@ def test_rows_that_are_left_out_shift_no_colours(tmp_path: Path):
     assert torch.equal(read(VIEWS[0]).rgb, held(VIEWS[0]).rgb)
 
 
-@pytest.mark.usefixtures("in_chunks")
-def test_a_file_that_changes_is_noticed(tmp_path: Path):
+def test_a_file_that_changes_is_noticed(in_chunks, tmp_path: Path):
     path, scene = written(tmp_path)
     renderer = Renderer.of(path, VIEWS, "classic")
     write_scene(path, scene[:2000], overwrite=True)
@@ -80,8 +77,7 @@ def test_a_file_that_changes_is_noticed(tmp_path: Path):
         renderer(VIEWS[0])
 
 
-@pytest.mark.usefixtures("in_chunks")
-def test_another_process_reads_the_file_itself(tmp_path: Path):
+def test_another_process_reads_the_file_itself(in_chunks, tmp_path: Path):
     renderer = Renderer.of(written(tmp_path)[0], VIEWS, "classic").portable()
     sent = pickle.dumps(renderer)
     assert len(sent) < A_GAUSSIAN * len(renderer.scene)

@@ -36,12 +36,13 @@ from aaplug.methods.pixel_kernels.point import Point
 from aaplug.system.errors import FormatError, PlugInError, UsageError
 from aaplug.system.registry import Registry, _points_of
 from aaplug.system.signals import _exit
-from tests.conftest import ROOT, SAMPLE
+from tests.conftest import ROOT, SAMPLE, run_python
 from tests.test_documented import GAUSSIANS, few, write_cameras
 
 GUIDE = (ROOT / "examples" / "guides" / "contributing.md").read_text()
 PROGRAM = """
-import json, sys
+import json, os, sys
+os.chdir("{folder}")
 from aaplug_cli.main import main
 for words in json.loads(sys.argv[1]):
     try:
@@ -58,29 +59,20 @@ LOOK = "{name} 40 30 50  {x} -4 1  0 0 0  {held_out}\n"  # see camera_format.py
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of a process that has the plug-in installed, without pip: a .dist-info on the path is enough."""
-    folder = tmp_path_factory.mktemp("site")
-    (folder / "stranger").mkdir()
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which one process with the plug-in has run the guide's commands, a `--help` and `recipes`.
+
+    The plug-in is installed without pip: a .dist-info on the path is enough.
+    """
+    site, folder = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("theirs")
+    (site / "stranger").mkdir()
     for name, text in FILES.items():
-        (folder / "stranger" / name).write_text(text)
-    record = folder / "stranger-1.0.dist-info"
+        (site / "stranger" / name).write_text(text)
+    record = site / "stranger-1.0.dist-info"
     record.mkdir()
     (record / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
-    lines = [
-        line
-        for group, points in GROUPS.items()
-        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in points.items()))
-    ]
-    (record / "entry_points.txt").write_text("\n".join(lines))
-    path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return {**os.environ, "PYTHONPATH": path, "COLUMNS": "400"}
-
-
-@pytest.fixture(scope="module")
-def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which one process with the plug-in has run the guide's commands, a `--help` and `recipes`."""
-    folder = tmp_path_factory.mktemp("theirs")
+    groups = ("\n".join([f"[{group}]", *map(" = ".join, points.items())]) for group, points in GROUPS.items())
+    (record / "entry_points.txt").write_text("\n".join(groups))
     write_scene(folder / "scene.ply", few(read_scene(SAMPLE / "chair.ply").gaussians()))
     write_cameras(folder / "path" / "to" / "colmap")
     views = [("left", -1, 0), ("right", 1, 0), ("held", 0, 1)]
@@ -88,9 +80,8 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
     (folder / "views.look").write_text("".join(lines))
     commands = [line for line in GUIDE.splitlines() if line.startswith("aaplug ")]
     words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help", "aaplug recipes"]]
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(words)], cwd=folder, env=installed, capture_output=True, text=True
-    )
+    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = run_python(PROGRAM.format(folder=folder), json.dumps(words), PYTHONPATH=path, COLUMNS=400)
     assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-5000:]
     (folder / "stdout").write_text(done.stdout)
     return folder

@@ -37,9 +37,6 @@ def free(camera: Camera) -> Camera:
     return replace(camera, trained_focal=None)
 
 
-# preparing --------------------------------------------------------------------------------------
-
-
 def test_a_world_filter_is_applied_once_when_the_renderer_is_made(cameras):
     scene = make_scene(200)
     renderer = Renderer.of(scene, cameras, "mip-splatting", rasterizer="eager")
@@ -256,9 +253,6 @@ def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras
     assert seen[1:] == [33, 33, 33, 33, 33, 33, 2]
 
 
-# neighbours -------------------------------------------------------------------------------------
-
-
 def test_softening_spreads_a_sample_over_its_neighbours():
     rgb = torch.zeros(5, 6, 3)
     rgb[2, 3] = 1.0
@@ -306,9 +300,6 @@ def test_auto_is_nearer_to_the_look_of_training_than_one_plain_sample(sample_sce
     look = best(view).rgb
     errors = [(renderer(view).rgb - look).square().mean() for renderer in (plain, fast)]
     assert errors[1] < 0.9 * errors[0]
-
-
-# rates ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("distance", "rate"), [(4.0, 1.0), (2.0, 2.0), (16.0, 0.25)])
@@ -365,9 +356,6 @@ def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanc
     assert counts == [fast, balanced, best]
 
 
-# images -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("convention", CONVENTIONS.values(), ids=CONVENTIONS)
 def test_matched_is_training_itself_at_every_view_of_the_training_size(convention, cameras):
     scene = replace(make_scene(200), convention=convention)
@@ -413,9 +401,6 @@ class ByDepth:
 
     def __call__(self, *args: Any, **options: Any) -> Render:
         raise AssertionError
-
-
-# names ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
