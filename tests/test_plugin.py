@@ -241,21 +241,15 @@ def tuned(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: 
     finetune(make_scene(20), CAMERAS, folder / "tuned.ply", loss="wrong", steps=1, rasterizer="eager")
 
 
-def opened(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    monkeypatch.setitem(SCENE_FORMATS._entries, "wrong", Wrong(answers))
-    (folder / "scene.wrong").write_text("x")
-    read_scene(folder / "scene.wrong").gaussians()
+def filed(formats: Registry[Any], use: Callable[[Path], Any]) -> Callable[..., None]:
+    """Uses a file of the wrong format."""
 
+    def used(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        monkeypatch.setitem(formats._entries, "wrong", Wrong(answers))
+        (folder / "file.wrong").write_text("x")
+        use(folder / "file.wrong")
 
-def written(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    monkeypatch.setitem(SCENE_FORMATS._entries, "wrong", Wrong(answers))
-    write_scene(folder / "scene.wrong", make_scene(3))
-
-
-def cameras_read(answers: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    monkeypatch.setitem(CAMERA_FORMATS._entries, "wrong", Wrong(answers))
-    (folder / "views.wrong").write_text("x")
-    read_cameras(folder / "views.wrong")
+    return used
 
 
 VERBS = {
@@ -266,9 +260,11 @@ VERBS = {
     "compositor wrong": lambda answers, *_: drawn(compositor=WrongCompositor(answers=answers)),
     "metric wrong": evaluated,
     "loss wrong": tuned,
-    "scene format wrong": opened,
-    "writing scene format wrong": written,
-    "camera format wrong": cameras_read,
+    "scene format wrong": filed(SCENE_FORMATS, lambda path: read_scene(path).gaussians()),
+    "writing scene format wrong": filed(
+        SCENE_FORMATS, lambda path: write_scene(path.with_name("new.wrong"), make_scene(3))
+    ),
+    "camera format wrong": filed(CAMERA_FORMATS, read_cameras),
 }
 NAN = "expected finite numbers, got"
 MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
@@ -311,7 +307,7 @@ MISTAKES: dict[tuple[str, str], tuple[Callable[..., Any], str]] = {
     ("scene format wrong", "returns nothing"): (lambda *_: None, "should return a Scene, got None"),
     ("scene format wrong", "loads"): (
         lambda path, _: Scene(path, "wrong", 3, 0, fails, ""),
-        "scene.wrong with KeyError: 'key', in line",
+        "file.wrong with KeyError: 'key', in line",
     ),
     ("writing scene format wrong", "writes nothing"): (lambda *_: None, "has not written"),
     ("camera format wrong", "returns a list"): (lambda *_: [make_camera()], "CameraSet, got a list of a Camera"),
@@ -349,8 +345,8 @@ def test_a_camera_format_that_fails_after_another_read_the_folder_is_named(monke
 
 
 def test_a_camera_file_without_cameras_is_named(monkeypatch, tmp_path):
-    with pytest.raises(FormatError, match=r"views\.wrong: holds no training cameras"):
-        cameras_read(lambda *_: CameraSet((), ()), monkeypatch, tmp_path)
+    with pytest.raises(FormatError, match=r"file\.wrong: holds no training cameras"):
+        VERBS["camera format wrong"](lambda *_: CameraSet((), ()), monkeypatch, tmp_path)
 
 
 def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
