@@ -257,18 +257,24 @@ EDITS = [
 ]
 
 
+DAMAGED = ("{}", "[]", '{"view": 0}', '{"view": 0, "measurements": [{}]}', '{"view": [], "measurements": []}')
+
+
 def test_a_journal_that_was_edited_by_hand_is_refused(look, views, tmp_path):
     path = tmp_path / "progress.jsonl"
     work = task(look, views, scales=(1.0, 0.5), recipes=("classic",), ceiling=False)
     evaluate(work, journal=path)
     *kept, last = path.read_text().splitlines()
+    damaged = [*DAMAGED]
     for key, value in EDITS:
         line = json.loads(last)
         if key in line:
             line[key] = value
         else:
             line["measurements"][1]["view" if key == "name" else key] = value
-        path.write_text("\n".join([*kept, json.dumps(line), ""]))
+        damaged.append(json.dumps(line))
+    for line in damaged:
+        path.write_text("\n".join([*kept, line, ""]))
         with pytest.raises(FormatError, match="its line 3 is damaged; remove the file to start again"):
             evaluate(work, journal=path, resume=True)
 
@@ -514,14 +520,3 @@ def test_nothing_is_made_before_the_first_view_and_a_place_that_cannot_be_writte
     journal = Journal(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
     with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):
         journal.add(0, [measured("a")])
-
-
-DAMAGED = ("{}", "[]", '{"view": 0}', '{"view": 0, "measurements": [{}]}', '{"view": [], "measurements": []}')
-
-
-@pytest.mark.parametrize("line", DAMAGED)
-def test_a_line_that_is_no_measurement_is_refused(tmp_path, line):
-    path = tmp_path / "progress.jsonl"
-    path.write_text('{"request": {}}\n' + line + "\n")
-    with pytest.raises(FormatError, match="its line 2 is damaged"):
-        Journal(path, {}, resume=True)

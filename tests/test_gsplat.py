@@ -662,49 +662,39 @@ def training() -> tuple[dict[str, Parameter], dict[str, Optimizer], Callable[...
     return params, {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}, draw
 
 
-def descend(loss: Tensor, optimizers: dict[str, Optimizer]) -> float:
-    """One step of every optimizer; returns the loss."""
-    for optimizer in optimizers.values():
-        optimizer.step()
-        optimizer.zero_grad()
-    return loss.item()
+def trained(name: str, steps: int, drawing: dict[str, object], **settings: object) -> dict[str, Parameter]:
+    """Parameters after some steps by a strategy of gsplat's own, which lower the loss."""
+    strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
+    strategy = getattr(strategies, name)(refine_start_iter=2, refine_every=2, **settings)
+    params, optimizers, draw = training()
+    strategy.check_sanity(params, optimizers)
+    after = {"lr": 1e-6} if name == "MCMCStrategy" else {"packed": drawing["packed"]}
+    with torch.no_grad():
+        params["opacities"][:5] = -5.0  # dead, and so relocated or pruned
+    state, losses = strategy.initialize_state(), []
+    with patch():
+        for step in range(steps):
+            loss, info = draw(**drawing)
+            if name == "DefaultStrategy":
+                strategy.step_pre_backward(params, optimizers, state, step, info)
+            loss.backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad()
+            strategy.step_post_backward(params, optimizers, state, step, info, **after)
+            losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    return params
 
 
 @pytest.mark.parametrize(("packed", "absgrad"), [(True, False), (False, True)])
 def test_gsplats_own_densification_reads_meta(packed, absgrad):
-    strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
-    params, optimizers, draw = training()
-    strategy = strategies.DefaultStrategy(
-        refine_start_iter=2, refine_every=2, grow_grad2d=1e-6, absgrad=absgrad, refine_scale2d_stop_iter=9
-    )
-    strategy.check_sanity(params, optimizers)
-    state = strategy.initialize_state()
-    losses = []
-    for step in range(6):
-        loss, info = draw(packed=packed, absgrad=absgrad)
-        strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss.backward()
-        strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
-        losses.append(descend(loss, optimizers))
-    assert losses[-1] < losses[0]
-    assert len(params["means"]) > 60
+    settings = {"grow_grad2d": 1e-6, "absgrad": absgrad, "refine_scale2d_stop_iter": 9}
+    assert len(trained("DefaultStrategy", 6, {"packed": packed, "absgrad": absgrad}, **settings)["means"]) > 60
 
 
 def test_gsplats_own_markov_chain_runs():
-    strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
-    params, optimizers, draw = training()
-    strategy = strategies.MCMCStrategy(cap_max=64, refine_start_iter=2, refine_every=2, min_opacity=0.2)
-    strategy.check_sanity(params, optimizers)
-    with torch.no_grad():
-        params["opacities"][:5] = -5.0  # dead, and so relocated
-    state, losses = strategy.initialize_state(), []
-    with patch():
-        for step in range(8):
-            loss, info = draw()
-            loss.backward()
-            losses.append(descend(loss, optimizers))
-            strategy.step_post_backward(params, optimizers, state, step, info, lr=1e-6)
-    assert losses[-1] < losses[0]
+    params = trained("MCMCStrategy", 8, {}, cap_max=64, min_opacity=0.2)
     assert len(params["means"]) == 64
     assert (params["opacities"].sigmoid() > 0.19).all()
 
