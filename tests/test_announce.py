@@ -138,16 +138,17 @@ def test_samples_have_a_bound(factor):
     assert renderer(tiny).rgb.shape == (1, 1, 3)
 
 
-@pytest.mark.parametrize(
-    ("lines", "file"),
-    [
-        ("0::/job/step\n", "memory.max"),
-        ("0::/job/step\n", "job/memory.max"),
-        ("9:cpu:/\n4:memory:/docker/1\n0::/\n", "memory/memory.limit_in_bytes"),
-        ("4:hugetlb,memory:/docker/1\n", "memory/docker/1/memory.limit_in_bytes"),
-    ],
-)
-def test_the_limit_of_a_container_counts(lines, file, monkeypatch, tmp_path):
+LIMITS = [  # groups of a process, and the file of a limit
+    ("0::/job/step\n", "memory.max"),
+    ("0::/job/step\n", "job/memory.max"),
+    ("9:cpu:/\n4:memory:/docker/1\n0::/\n", "memory/memory.limit_in_bytes"),
+    ("4:hugetlb,memory:/docker/1\n", "memory/docker/1/memory.limit_in_bytes"),
+]
+
+
+@pytest.mark.parametrize(("lines", "file"), LIMITS)
+def test_the_limit_of_a_container_counts_where_it_has_one(machine_alone, lines, file, monkeypatch, tmp_path):
+    machine = limits.usable_memory()
     root = tmp_path / "cgroup"
     (root / file).parent.mkdir(parents=True)
     (root / file).write_text("1000000000\n")
@@ -157,14 +158,7 @@ def test_the_limit_of_a_container_counts(lines, file, monkeypatch, tmp_path):
     monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "groups")
     assert limits.lack_of_memory(4e8) is None
     assert limits.lack_of_memory(6e8) == "0.6 GB, more than 50% of this container's 1.0 GB"
-
-
-def test_a_container_without_a_limit_leaves_the_machines(machine_alone, monkeypatch, tmp_path):
-    machine = limits.usable_memory()
-    (tmp_path / "memory.max").write_text("max\n")
-    (tmp_path / "groups").write_text("0::/\n")
-    monkeypatch.setattr(groups, "ROOT", tmp_path)
-    monkeypatch.setattr(groups, "CONTROL_GROUPS", tmp_path / "groups")
+    (root / file).write_text("max\n")
     assert limits.usable_memory() == machine
 
 

@@ -78,11 +78,6 @@ def places() -> tuple[Splats2D, Tensor]:
     return splats, (2 * torch.rand(12, 60, 2, generator=g, dtype=F64) - 1) * spread
 
 
-def test_the_point_kernel_is_the_value_at_the_centre(places):
-    splats, offsets = places
-    torch.testing.assert_close(POINT.exact(splats, offsets), gaussians_at(offsets, splats))
-
-
 @pytest.mark.parametrize("window", [0.3, 1.0])
 def test_the_integral_kernel_is_the_mean_over_the_turned_window(places, window):
     splats, offsets = replace(places[0], window=window), places[1]
