@@ -815,6 +815,7 @@ def test_patch_says_what_it_needs(monkeypatch, homes, missing, said):
 
 # ----------------------------------------------------------------------------------------------------------- mistakes
 
+ORTHO, FISHEYE = ({"camera_model": model} for model in ("ortho", "fisheye"))
 WRONG = {  # "[*b" stands for a tensor of floats
     "scales: expected torch.float64, as means have, got torch.float32": {"scales": torch.ones(40, 3)},
     "means: expected [*b, n, 3], got float32 [40, 2]": {"means": torch.zeros(40, 2)},
@@ -860,17 +861,12 @@ WRONG = {  # "[*b" stands for a tensor of floats
     "with_eval3d: only False is supported": {"with_eval3d": True},
     "ftheta_coeffs: only None is supported on the CPU, got float32 [3]": {"ftheta_coeffs": torch.ones(3)},
     "radial_coeffs: expected shape [2, 6], got [2, 4]": {"radial_coeffs": torch.ones(2, 4)},
-    "radial_coeffs: expected shape [2, 4], got [2, 6]": {"radial_coeffs": torch.ones(2, 6), "camera_model": "fisheye"},
+    "radial_coeffs: expected shape [2, 4], got [2, 6]": FISHEYE | {"radial_coeffs": torch.ones(2, 6)},
     "radial_coeffs: expected finite numbers, got NaN": {"radial_coeffs": torch.full((2, 6), math.nan)},
-    "radial_coeffs: camera_model ortho has none, got float32 [2, 6]": {
-        "radial_coeffs": torch.ones(2, 6),
-        "camera_model": "ortho",
-    },
+    "radial_coeffs: camera_model ortho has none, got float32 [2, 6]": ORTHO | {"radial_coeffs": torch.ones(2, 6)},
     "tangential_coeffs: expected [*b, c, 2] or None": {"tangential_coeffs": torch.ones(2)},
-    "thin_prism_coeffs: camera_model fisheye has none, got float32 [2, 4]": {
-        "thin_prism_coeffs": torch.ones(2, 4),
-        "camera_model": "fisheye",
-    },
+    "thin_prism_coeffs: camera_model fisheye has none, got float32 [2, 4]": FISHEYE
+    | {"thin_prism_coeffs": torch.ones(2, 4)},
     "rolling_shutter: only GLOBAL is supported on the CPU, got 'TOP'": {"rolling_shutter": Enum("Rows", ["TOP"]).TOP},
     "viewmats_rs: only None is supported": {"viewmats_rs": torch.zeros(2, 4, 4)},
     "colors: expected colours for render_mode RGB, got None": {"colors": None},
