@@ -8,11 +8,12 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import re
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+
+import numpy as np
 
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
@@ -28,45 +29,31 @@ CODES = {
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip  # numpy's name of each type; its digit is the size
-
-
-@dataclass(frozen=True)
-class Property:
-    """A column: the type of its values and, for lists, of their stored length."""
-
-    name: str
-    code: str
-    length_code: str | None = None
+}  # fmt: skip  # numpy's name of each type
+LENGTHS = [[], *(["list", kind] for kind in CODES)]  # words before a column's type: of a scalar, and of a list
 
 
 @dataclass(frozen=True)
 class Element:
-    """A table."""
+    """A table.
+
+    codes: numpy's name of each column's type, of a list that of its stored length.  lists: the columns that are lists.
+    """
 
     name: str
     count: int
-    properties: tuple[Property, ...] = ()
+    codes: dict[str, str] = field(default_factory=dict)
+    lists: list[str] = field(default_factory=list)
 
     @property
-    def stride(self) -> int:
-        """Size of a row whose lists are empty."""
-        return sum(int((p.length_code or p.code)[1:]) for p in self.properties)
+    def dtype(self) -> np.dtype:
+        """A row in a little-endian file, all lists empty."""
+        return np.dtype([(name, f"<{code}") for name, code in self.codes.items()])
 
     @property
     def least_size(self) -> int:
         """Size of the table if all lists are empty."""
-        return self.count * self.stride
-
-    @property
-    def lists(self) -> list[str]:
-        """Names of the columns that hold lists."""
-        return [p.name for p in self.properties if p.length_code]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all columns."""
-        return [p.name for p in self.properties]
+        return self.count * self.dtype.itemsize
 
 
 @dataclass(frozen=True)
@@ -168,8 +155,7 @@ def is_packed(path: Path) -> bool:
 def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:
     """Parse a header's lines; `size` is that of the header in its file."""
     lines = tuple(lines)
-    tables: list[tuple[str, int, list[Property]]] = []
-    formats: list[list[str]] = []
+    elements, formats = dict[str, Element](), list[list[str]]()
     for number, line in enumerate(lines[1:-1], start=2):
         match line.split():
             case ["comment" | "obj_info", *_] | []:
@@ -182,31 +168,29 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
                 if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
                     got = repr(count[:MAX_VALUE_CHARACTERS])
                     raise FormatError(path, f"element {name!r} has the impossible count {got}")
-                tables.append((name, int(count), []))
-            case ["property", kind, name] if tables and kind in CODES:
-                tables[-1][2].append(Property(name, CODES[kind]))
-            case ["property", "list", length, kind, name] if tables and length in CODES and kind in CODES:
-                tables[-1][2].append(Property(name, CODES[kind], CODES[length]))
+                if name in elements:
+                    raise FormatError(path, f"element {name!r} is declared twice")
+                elements[name] = Element(name, int(count))
+            case ["property", *length, kind, column] if elements and kind in CODES and length in LENGTHS:
+                *_, element = elements.values()
+                if column in element.codes:
+                    raise FormatError(path, f"property of {element.name} {column!r} is declared twice")
+                element.codes[column] = CODES[length[-1] if length else kind]
+                element.lists.extend([column] if length else [])
             case _:
                 raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_VALUE_CHARACTERS]!r}")
     coding = next((coding for coding in (LITTLE, BIG, TEXT) if formats == [[coding, "1.0"]]), None)
     if coding is None:
         words = " and ".join(" ".join(words)[:MAX_VALUE_CHARACTERS] for words in formats) or "none"
         raise FormatError(path, f"its format is {words}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
-    names = [f"element {name!r}" for name, _, _ in tables]
-    names += [f"property of {name} {column.name!r}" for name, _, columns in tables for column in columns]
-    for name, times in Counter(names).items():
-        if times > 1:
-            raise FormatError(path, f"{name} is declared twice")
-    elements = tuple(Element(name, count, tuple(columns)) for name, count, columns in tables)
     size = sum(len(line + newline) for line in lines) if size is None else size
-    return Header(path, lines, newline, elements, coding, size)
+    return Header(path, lines, newline, tuple(elements.values()), coding, size)
 
 
 def check_size(header: Header, actual: int) -> None:
     """Compare the file's size with what the header promises, before anything is allocated."""
     if header.coding == TEXT:
-        least = header.size + sum(e.count * len(e.properties) * MIN_TEXT_SIZE for e in header.elements)
+        least = header.size + sum(e.count * len(e.codes) * MIN_TEXT_SIZE for e in header.elements)
         if actual < least - 1:  # the last line may lack its line end
             need = f"the values that its header promises need {least:,} bytes at least"
             raise FormatError(header.path, f"is cut short: {need}, and it has {actual:,}")
@@ -214,7 +198,7 @@ def check_size(header: Header, actual: int) -> None:
     least = header.size + sum(e.least_size for e in header.elements)
     if actual < least:
         vertex = header.vertex
-        room = (actual - header.start_of(vertex)) // max(1, vertex.stride)
+        room = (actual - header.start_of(vertex)) // max(1, vertex.dtype.itemsize)
         what = f"its header promises {least:,} bytes and it has {actual:,}"
         whole = f"{max(0, min(vertex.count, room)):,} of {vertex.count:,} Gaussians are whole"
         raise FormatError(header.path, f"is cut short: {what}; {whole}; get the file again")

@@ -35,7 +35,7 @@ def sniff(path: Path) -> bool:
 def has_camera(header: Header) -> bool:
     """True if the tables are there, each with as many values as it needs."""
     tables = {element.name: element for element in header.elements}
-    names = [(table, tables[table].count, tables[table].names) for table in SHAPES if table in tables]
+    names = [(table, tables[table].count, [*tables[table].codes]) for table in SHAPES if table in tables]
     whole = names == [(table, int(np.prod(shape)), [table]) for table, shape in SHAPES.items()]
     return whole and header.coding != TEXT and not any(element.lists for element in header.elements)
 
@@ -61,6 +61,6 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
 
 def _values(path: Path, header: Header, table: str) -> list[Any]:
     element = next(element for element in header.elements if element.name == table)
-    dtype = np.dtype((">" if header.coding == BIG else "<") + element.properties[0].code)
     data = read_part(path, header.start_of(element), element.least_size)
-    return np.frombuffer(data, dtype).reshape(SHAPES[table]).tolist()
+    dtype = element.dtype.newbyteorder(">" if header.coding == BIG else "<")
+    return np.frombuffer(data, dtype)[table].reshape(SHAPES[table]).tolist()

@@ -56,10 +56,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         header = read_header(path)
         check_size(header, path.stat().st_size)
         _check(path, header)
-        stamp, tables = stamp_of(path), {}
-        for element in header.elements:
-            dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-            tables[element.name] = Table(path, header.start_of(element), element.count, dtype, stamp)
+        stamp = stamp_of(path)
+        tables = {e.name: Table(path, header.start_of(e), e.count, e.dtype, stamp) for e in header.elements}
         said = meaning(header, compressed=True)
         bounds = tables["chunk"].read(0, tables["chunk"].count)
     sh = tables.get("sh")
@@ -76,19 +74,17 @@ def _check(path: Path, header: Header) -> None:
     _need(path, header.vertex, WORDS, "u4")
     if chunk is None or chunk.count * CHUNK_LENGTH < count:
         raise FormatError(path, f"has {chunk.count if chunk else 0:,} chunks, too few for {count:,} Gaussians")
-    coloured = COLOUR_BOUNDS if COLOUR_BOUNDS[0] in chunk.names else []
+    coloured = COLOUR_BOUNDS if COLOUR_BOUNDS[0] in chunk.codes else []
     _need(path, chunk, [*BOUNDS, *SCALE_BOUNDS, *coloured], "f4")
     if sh := elements.get("sh"):
-        rest = len(sh.properties)
+        rest = len(sh.codes)
         if sh.count != count or rest not in DEGREES:
             raise FormatError(path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians")
         _need(path, sh, [f"f_rest_{i}" for i in range(rest)], "u1")
 
 
 def _need(path: Path, element: Element, columns: Sequence[str], code: str) -> None:
-    codes = {p.name: p.code for p in element.properties}
-    missing = [c for c in columns if codes.get(c) != code]
-    if missing:
+    if missing := [c for c in columns if element.codes.get(c) != code]:
         raise FormatError(path, f"element {element.name!r} needs {missing[0]} as {code}")
 
 

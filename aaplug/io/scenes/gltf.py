@@ -10,13 +10,14 @@ applied, where they turn, move and scale alike along all axes.  glTF has no word
 of ours in the primitive's `extras`.
 """
 
+import io
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, chain
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import torch
@@ -93,25 +94,21 @@ class GltfFormat:
         if self.name == "glb":
             _write_glb(path, held, count, overwrite)
             return
-        scenes = list(held)
+        scenes, buffer = list(held), io.BytesIO()
         document = _Document(path, scenes[0], sum(map(len, scenes)))
         for part in scenes:
-            document.add(part)
+            document.add(part, buffer if self.name == "gltf" else None)
         if self.name == "spz.glb":
             blob = spz.packed(path, scenes, 2, "RUB")
             blob += bytes(-len(blob) % 4)
             write_file(path, glb_start(document.json(blob=len(blob)), len(blob)) + blob, overwrite)
         else:
-            data = bytearray(document.size)
-            for part in scenes:
-                for at, values in document.placed(part):
-                    data[at : at + len(values)] = values
             name = f"{path.stem}.bin"
 
             def whole(names: Mapping[str, str]) -> bytes:
                 return json.dumps(document.json(uri=names[name]), separators=(",", ":")).encode()
 
-            replacing_group(path, {name: bytes(data)}, whole, overwrite)
+            replacing_group(path, {name: buffer.getvalue()}, whole, overwrite)
 
 
 FORMATS = (GltfFormat("spz.glb"), GltfFormat("glb"), GltfFormat("gltf"))
@@ -200,26 +197,22 @@ class _Document:
         self.widths = widths | {COLOUR: 4} | dict.fromkeys(harmonics(first.sh_degree), 12)  # bytes a Gaussian
         *starts, self.size = (count * width for width in accumulate(self.widths.values(), initial=0))
         self.starts = dict(zip(self.widths, starts, strict=True))
-        self.first, self.count = first, 0
-        self.path = path
-        self.least, self.most = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
-        self.written = 0
+        self.path, self.first, self.count = path, first, 0
+        self.box = first.means[:0]  # smallest and largest position, once there is one
 
-    def add(self, part: Gaussians) -> None:
-        """Count a part."""
+    def add(self, part: Gaussians, stream: BinaryIO | io.BytesIO | None, begin: int = 0) -> None:
+        """Count a part, and write its attributes into the buffer that begins there in a stream."""
+        if stream is not None:
+            rgba = torch.cat([part.base_colours, part.opacities[:, None]], dim=1)
+            values = [part.means, part.unit_quats.roll(-1, dims=1), part.scales, part.opacities]
+            columns = [each.contiguous().numpy().astype("<f4") for each in (*values, *part.sh.unbind(dim=1))]
+            columns.insert(4, bytes_of(rgba * 255))
+            for (name, start), column in zip(self.starts.items(), columns, strict=True):
+                stream.seek(begin + start + self.count * self.widths[name])
+                stream.write(column.tobytes())
         self.count += len(part)
-        if len(part):
-            self.least, self.most = self.least.minimum(part.means.amin(0)), self.most.maximum(part.means.amax(0))
-
-    def placed(self, part: Gaussians) -> list[tuple[int, bytes]]:
-        """The bytes of the next part's attributes, and where they go."""
-        rgba = torch.cat([part.base_colours, part.opacities[:, None]], dim=1)
-        values = [part.means, part.unit_quats.roll(-1, dims=1), part.scales, part.opacities]
-        columns = [each.contiguous().numpy().astype("<f4") for each in (*values, *part.sh.unbind(dim=1))]
-        columns.insert(4, bytes_of(rgba * 255))
-        starts = [start + self.written * self.widths[name] for name, start in self.starts.items()]
-        self.written += len(part)
-        return [(at, column.tobytes()) for at, column in zip(starts, columns, strict=True)]
+        if len(means := torch.cat([self.box, part.means])):
+            self.box = torch.stack([means.amin(dim=0), means.amax(dim=0)])
 
     def json(self, uri: str | None = None, blob: int | None = None) -> dict[str, Any]:
         """The document; `blob`: the size of a .spz that holds the rows, instead of the attributes."""
@@ -230,12 +223,12 @@ class _Document:
             if blob is not None and name in harmonics(0):  # CesiumJS takes one more attribute for no harmonics at all
                 continue
             names[name] = len(accessors)
-            kind = {4: "SCALAR", 12: "VEC3", 16: "VEC4"}[width] if name != COLOUR else "VEC4"
+            kind = {4: "SCALAR", 12: "VEC3", 16: "VEC4"}[width]
             accessor = {"componentType": FLOAT, "count": self.count, "type": kind}
             if name == COLOUR:
-                accessor |= {"componentType": BYTES, "normalized": True}
+                accessor |= {"componentType": BYTES, "type": "VEC4", "normalized": True}
             if name == "POSITION":
-                accessor |= {"min": self.least.tolist(), "max": self.most.tolist()}
+                accessor |= dict(zip(("min", "max"), self.box.tolist(), strict=True))
             if blob is None:
                 accessor["bufferView"] = len(views)
                 stretch = {"byteOffset": self.starts[name], "byteLength": self.count * width}
@@ -273,10 +266,7 @@ def _write_glb(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bo
         raise OutputError(path, f"a .glb has at most {MOST_BYTES:,} bytes, {document.size:,} needed; write a .ply")
     with replacing(path, overwrite) as stream:
         for part in chain([first], parts):
-            document.add(part)
-            for at, values in document.placed(part):
-                stream.seek(start + at)
-                stream.write(values)
+            document.add(part, stream, start)
         stream.truncate(start + document.size)
         stream.seek(0)
         stream.write(glb_start(document.json(), document.size, room))

@@ -81,7 +81,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
             for at in range(0, len(part), ROWS_PER_WRITE):
                 stream.write(_records(header, part[at : at + ROWS_PER_WRITE]).tobytes())
             written += len(part)
-        size = start + written * header.vertex.stride
+        size = start + written * header.vertex.dtype.itemsize
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
         stream.write(document.bytes_of(document.after))
@@ -100,7 +100,7 @@ def beside(scene: Gaussians) -> str:
     columns, tables, comments = [*scene.extras], list[str](), list[str]()
     if document := _document_of(scene):
         header, usual = document.header, {*scene.extras, *NORMALS, *BYTE_COLOURS}
-        columns += [c for c in header.vertex.names if c not in usual and not _is_parameter(c)]
+        columns += [c for c in header.vertex.codes if c not in usual and not _is_parameter(c)]
         tables = [element.name for element in header.elements if element is not header.vertex]
         comments = [comment for comment in header.comments if UP_AXIS.fullmatch(comment)]
     named = {"columns": columns, "tables": tables, "comments": comments}
@@ -108,35 +108,32 @@ def beside(scene: Gaussians) -> str:
 
 
 def _rest(header: Header) -> list[str]:
-    return [column for column in header.vertex.names if REST.fullmatch(column)]
+    return [column for column in header.vertex.codes if REST.fullmatch(column)]
 
 
 def _check_columns(header: Header) -> list[str]:
     """Check the columns; notes on unusual ones that are understood."""
     vertex = header.vertex
-    columns = {p.name: p for p in vertex.properties}
+    columns = vertex.codes
     if vertex.lists:
         raise FormatError(header.path, f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only")
-    coloured = all(c in columns and columns[c].code == "u1" for c in BYTE_COLOURS) and not columns.keys() & {*COLOURS}
+    coloured = all(c in columns and columns[c] == "u1" for c in BYTE_COLOURS) and not columns.keys() & {*COLOURS}
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
-    missing = [c for c in REQUIRED if c not in columns and c not in optional]
-    if missing:
+    if missing := [c for c in REQUIRED if c not in columns and c not in optional]:
         lacks = f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has"
         raise FormatError(header.path, f"{lacks}; is it a point cloud or a mesh?")
-    used = [p for p in vertex.properties if _is_parameter(p.name)]
-    wrong = [p.name for p in used if p.code not in ("f4", "f8")]
-    if wrong:
+    used = {c: code for c, code in columns.items() if _is_parameter(c)}
+    if wrong := [c for c, code in used.items() if code not in ("f4", "f8")]:
         raise FormatError(header.path, f"{listing(wrong)} must be float; convert the file to float32")
     rest = _rest(header)
     if len(rest) not in DEGREES:
         raise FormatError(header.path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72")
-    gaps = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]
-    if gaps:
+    if gaps := [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]:
         raise FormatError(header.path, f"has {len(rest)} f_rest columns, but not {listing(gaps)}")
-    double = [p.name for p in used if p.code == "f8"]
+    double = [*used.values()].count("f8")
     notes = {
         f"coding: {header.coding}": header.coding != LITTLE,
-        f"{counted(len(double), 'column')} of float64, used as float32": double,
+        f"{counted(double, 'column')} of float64, used as float32": double > 0,
         "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in columns for c in EXTRAS),
         "learned filters, for the recipe learned": any(map(LEARNED_COLUMN.fullmatch, columns)),
         "colours from the columns red, green, blue; no harmonics": coloured,
@@ -194,8 +191,8 @@ def _header(document: Document, scene: Gaussians, count: int) -> Header:
     """The document's header for this scene: count, columns, convention and fusions."""
     old, (wanted, _) = document.header, matrix_of(scene[:0])
     spare = SCALES[2] if scene.flat else None
-    dropped = [c for c in old.vertex.names if _is_parameter(c) and c not in wanted and c != spare]
-    added = [column for column in (*wanted, *scene.extras) if column not in old.vertex.names]
+    dropped = [c for c in old.vertex.codes if _is_parameter(c) and c not in wanted and c != spare]
+    added = [column for column in (*wanted, *scene.extras) if column not in old.vertex.codes]
     read = None if document.table is None else old
     return stating(old.rewritten(count, dropped, added), read, scene.convention, scene.fused)
 
@@ -209,22 +206,22 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
 
     In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
-    records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in header.vertex.properties]))
+    records = np.zeros(len(scene), header.vertex.dtype)
     parameters, matrix = matrix_of(scene)
     assert not matrix.isnan().any(), "a parameter is NaN"
     values = dict(zip(parameters, matrix.detach().cpu().numpy().T, strict=True))
     values |= {name: column.cpu().numpy() for name, column in scene.extras.items()}
     old, document = {}, _document_of(scene)
-    unchanged = any(p.name not in values or p.code != "f4" for p in header.vertex.properties)
+    unchanged = any(c not in values or code != "f4" for c, code in header.vertex.codes.items())
     if unchanged and document and document.table and scene.origin:
         rows = document.table.take(scene.origin.rows.cpu())
         old = {name: rows[name] for name in rows.dtype.names or ()}
-    for p in header.vertex.properties:
-        new, was = values.get(p.name), old.get(p.name)
+    for column, code in header.vertex.codes.items():
+        new, was = values.get(column), old.get(column)
         if new is None:
             new = was
-        elif was is not None and p.code != "f4":
+        elif was is not None and code != "f4":
             new = np.where(was.astype(np.float32) == new, was, new)
         if new is not None:
-            records[p.name] = new
+            records[column] = new
     return records

@@ -86,9 +86,9 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
     """Locate the tables of a file; parse those that numpy cannot read."""
     vertex = header.vertex
     if header.coding == LITTLE and not any(e.lists for e in header.elements):
-        dtype, start = np.dtype([(p.name, "<" + p.code) for p in vertex.properties]), header.start_of(vertex)
-        table, end = Table(path, start, vertex.count, dtype, stamp), start + vertex.least_size
-        return Document(header, table, (header.size, start), (end, stamp[0]))
+        start = header.start_of(vertex)
+        table = Table(path, start, vertex.count, vertex.dtype, stamp)
+        return Document(header, table, (header.size, start), (start + vertex.least_size, stamp[0]))
     elements, at = _parsed(header), header.elements.index(vertex)
     data, before, after = elements[at].data, _little(elements[:at]), _little(elements[at + 1 :])
     return Document(header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after)

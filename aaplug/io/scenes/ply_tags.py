@@ -60,7 +60,7 @@ def meaning(header: Header, compressed: bool = False) -> Facts:
     settings = [{k: v for k, v in record.items() if k != "convention"} for record in records if "fused" in record]
     fused = tuple(Fusion(each.pop("fused"), each) for each in settings)
     mode = _last(header, RENDER_MODE)
-    two_scales = not compressed and "scale_2" not in header.vertex.names
+    two_scales = not compressed and "scale_2" not in header.vertex.codes
     flat = two_scales or bool(mode and mode.lower() == FLAT_MODE)
     stated = [record["convention"] for record in records if "convention" in record]
     if not stated:
@@ -106,7 +106,7 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
 def _from_others(header: Header, mode: str | None, two_scales: bool) -> tuple[str, Convention]:
     """The evidence of others' tags and columns, and the convention that they state."""
     postshot = _last(header, POSTSHOT_TAG)
-    if FILTER_COLUMN in header.vertex.names:
+    if FILTER_COLUMN in header.vertex.codes:
         return f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused", MIP
     if mode is not None and mode.lower() == FLAT_MODE:
         return f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic", CLASSIC
