@@ -331,7 +331,7 @@ def _limits() -> Answer:
     rows += [(name, f"{value:,.12g}", unit, what, "fixed") for name, (value, unit, what) in fixed.items()]
     shown = [table(rows, ("limit", "value", "unit", "of", "set by"))]
     if (memory := usable_memory()) is not None:
-        shown.append(f"Memory: {memory}.")
+        shown.append(f"Memory: {memory[1]}.")
     return Answer(values | {name: value for name, (value, *_) in fixed.items()}, shown)
 
 

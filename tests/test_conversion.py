@@ -15,7 +15,6 @@ from aaplug.core.placing import mirrored, placed
 from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.io.limits import Memory
 from aaplug.methods.conversion import FITTED_VARIANCE, FORMS, carried, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
@@ -241,7 +240,7 @@ def test_places_that_do_not_fit_are_refused(options, problem):
 
 def test_all_scenes_together_should_fit_into_memory(monkeypatch):
     scene = make_scene(1000)
-    monkeypatch.setattr("aaplug.io.limits.usable_memory", lambda: Memory(3e5, "this machine's {}"))
+    monkeypatch.setattr("aaplug.io.limits.usable_memory", lambda: (3e5, "this machine's 0.0 GB"))
     assert len(aaplug.merge([scene])) == 1000
     with pytest.raises(UsageError, match=r"scenes: their 2,000 Gaussians take .* more than 50% of this machine's"):
         aaplug.merge([scene, scene])

@@ -29,7 +29,7 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.evaluation.alignment import PAIR_DISTANCE, mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Report, literal, mean, spread_of, tables
-from aaplug.io.scenes.faults import usable
+from aaplug.io.scenes.columns import usable
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FrameError
 

@@ -49,17 +49,12 @@ def write_layers(
         with replacing(path, overwrite) as stream:
             np.savez(stream, colorSpace=COLOURS[storage.colour], **arrays)
     else:
-        write_file(path, _picture(chosen, storage), overwrite)
-
-
-def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -> bytes:
-    """A file of colours, of straight colours and alpha, or of alpha alone."""
-    image, alpha = layers.get("rgb"), layers.get("alpha")
-    if alpha is not None:
-        matte = alpha[..., None]
-        image = matte if image is None else torch.cat([straight(image, alpha), matte], dim=2)
-    assert image is not None
-    return encoded(f".{storage.format.name}", image, bit_depth=storage.bit_depth)
+        image, alpha = chosen.get("rgb"), chosen.get("alpha")  # a file of colours, of both straight, or of alpha alone
+        if alpha is not None:
+            matte = alpha[..., None]
+            image = matte if image is None else torch.cat([straight(image, alpha), matte], dim=2)
+        assert image is not None
+        write_file(path, encoded(f".{storage.format.name}", image, bit_depth=storage.bit_depth), overwrite)
 
 
 def _write_exr(

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from aaplug.system import groups
 from aaplug.system.errors import UsageError
@@ -70,9 +69,9 @@ def whole_limit(name: str) -> int:
 def lack_of_memory(needed: int | float) -> str | None:
     """The reason that this process cannot hold so many bytes, in words; None if it can, or its memory is unknown."""
     memory, share = usable_memory(), limit("MEMORY_SHARE")
-    if memory is None or needed <= share * memory.bytes:
+    if memory is None or needed <= share * memory[0]:
         return None
-    return f"{needed / 1e9:.1f} GB, more than {share:.0%} of {memory}"
+    return f"{needed / 1e9:.1f} GB, more than {share:.0%} of {memory[1]}"
 
 
 def lack_for_samples(count: int) -> str | None:
@@ -80,25 +79,15 @@ def lack_for_samples(count: int) -> str | None:
     return lack_of_memory(SAMPLE_BYTES * count) if count > UNCHECKED_SAMPLES else None
 
 
-class Memory(NamedTuple):
-    """Bytes that this process may take, and who says so, in words with a place for the number."""
-
-    bytes: float
-    words: str
-
-    def __str__(self) -> str:
-        return self.words.format(f"{self.bytes / 1e9:.1f} GB")
-
-
-def usable_memory() -> Memory | None:
-    """The least that machine, container and `ulimit -v` leave to this process; None where the system does not say."""
+def usable_memory() -> tuple[float, str] | None:
+    """The bytes that machine, container and `ulimit -v` leave to this process, and in words; None if nobody says."""
     candidates = []
     with suppress(AttributeError, ValueError, OSError):
         machine = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-        candidates.append(Memory(machine, "this machine's {}"))
+        candidates.append((machine, "this machine's {}"))
     for [most] in groups.limits("memory", ["memory.max"], ["memory.limit_in_bytes"]):
         if most >= 0:
-            candidates.append(Memory(most, "this container's {}"))
+            candidates.append((most, "this container's {}"))
     with suppress(ImportError, OSError):
         import resource
 
@@ -106,5 +95,6 @@ def usable_memory() -> Memory | None:
         if most != resource.RLIM_INFINITY:
             pages = int(STATM.read_text().split()[0]) if STATM.exists() else 0
             left = max(0.0, float(most - pages * os.sysconf("SC_PAGE_SIZE")))
-            candidates.append(Memory(left, "the {} that `ulimit -v` leaves"))
-    return min(candidates, default=None)
+            candidates.append((left, "the {} that `ulimit -v` leaves"))
+    least, words = min(candidates, default=(0.0, ""))
+    return (least, words.format(f"{least / 1e9:.1f} GB")) if words else None

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import read_start
+from aaplug.io.values import start_of
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError
 
 MAX_COUNT_DIGITS = 18  # still an int64
@@ -145,11 +145,7 @@ def read_header(path: Path) -> Header:
 
 def is_packed(path: Path) -> bool:
     """True if a .ply's header declares the packed words of a .compressed.ply.  Never raises."""
-    try:
-        start = read_start(path, whole_limit("HEADER"))
-    except FormatError:
-        return False
-    return bool(PACKED.search(start.partition(b"end_header")[0]))
+    return bool(PACKED.search(start_of(path, whole_limit("HEADER")).partition(b"end_header")[0]))
 
 
 def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:

@@ -1,7 +1,7 @@
 """Values from untrusted files: their size, type and range are checked before they are used.
 
-Sizes and focal lengths are in px.  Every function but `mentions` raises `FormatError` and nothing else; it names the
-file, the entry and the field, and says what was expected and what was found.
+Sizes and focal lengths are in px.  A function that raises, raises `FormatError` and nothing else; it names the file,
+the entry and the field, and says what was expected and what was found.
 """
 
 import json
@@ -135,6 +135,14 @@ def read_start(path: Path, size: int) -> bytes:
     return read_part(path, 0, size, short=True)
 
 
+def start_of(path: Path, size: int = HEAD_LIMIT) -> bytes:
+    """The first bytes of a file; none if it cannot be read.  Never raises."""
+    try:
+        return read_start(path, size)
+    except FormatError:
+        return b""
+
+
 def read_part(path: Path, start: int, size: int, short: bool = False) -> bytes:
     """`size` bytes of a file from `start`; fewer are an error unless `short`."""
     if not os.path.isfile(path):  # reading a pipe would block
@@ -204,8 +212,5 @@ def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
     """True if one of these JSON keys stands in the first bytes of the file; False if it cannot be read."""
-    try:
-        start = read_start(path, HEAD_LIMIT)
-    except FormatError:
-        return False
+    start = start_of(path)
     return any(f'"{key}"'.encode() in start for key in keys)

@@ -18,7 +18,7 @@ from aaplug.core.rules import NEAR
 from aaplug.io.cameras import inria, read_cameras
 from aaplug.io.cameras.sets import described_sizes
 from aaplug.io.photographs import photo_of
-from aaplug.io.scenes.faults import usable
+from aaplug.io.scenes.columns import usable
 from aaplug.io.scenes.scene import Scene
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import AaplugError, counted

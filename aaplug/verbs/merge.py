@@ -17,7 +17,7 @@ from aaplug.core.placing import placed
 from aaplug.io.atomic import AnyPath
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import check_scene_output, scene_of, write_scene
-from aaplug.io.scenes.faults import check_values
+from aaplug.io.scenes.columns import check_values
 from aaplug.io.scenes.packed import of_degree
 from aaplug.io.scenes.ply import beside
 from aaplug.io.scenes.scene import memory_of

@@ -21,7 +21,7 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.io import STREAM_INDEXES
 from aaplug.io.atomic import AnyPath, check_output
 from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
-from aaplug.io.scenes.faults import described_faults, faults_of
+from aaplug.io.scenes.columns import described_faults, faults_of
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
@@ -45,7 +45,7 @@ class SceneFormat(Protocol):
     @property
     def name(self) -> str: ...  # noqa: D102
 
-    def sniff(self, path: Path, head: bytes) -> bool:
+    def sniff(self, path: Path, head: bytes, /) -> bool:
         """True if a file that begins with `head` is of this format.  Never raises."""
         ...
 

@@ -23,7 +23,7 @@ from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, fractions, sh_of_colour, without_largest, word_quats
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_tags import meaning, stating
-from aaplug.io.scenes.record import warn_of_moves, warn_of_sizes, whole
+from aaplug.io.scenes.record import along_curve, warn_of_moves, warn_of_sizes, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import PART, Scene
 from aaplug.system.errors import FormatError
@@ -120,7 +120,7 @@ def _between(
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene, with values rounded to the format's steps."""
-    scene = whole(path, parts, name, MOST_DEGREE)
+    scene = along_curve(whole(path, parts, name, MOST_DEGREE))
     chunk = torch.arange(len(scene)) // CHUNK_LENGTH
     colours = scene.base_colours
     log_scales = scene.log_scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
@@ -137,7 +137,8 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     columns = {"chunk": [*BOUNDS, *SCALE_BOUNDS, *COLOUR_BOUNDS], "vertex": list(WORDS)}
     tables = [torch.cat(bounds, dim=1).numpy().astype("<f4"), torch.stack(words, dim=1).numpy().astype("<u4")]
     if scene.sh_degree:
-        tables.append(np.concatenate([_harmonic_bytes(sh) for sh in scene.sh.split(PART)]))
+        rests = (rest.transpose(1, 2).flatten(1) / SH_SPAN + 0.5 for rest in scene.sh[:, 1:].split(PART))
+        tables.append(np.concatenate([bytes_of((rest * 256).floor()) for rest in rests]))
         columns["sh"] = [f"f_rest_{i}" for i in range(tables[-1].shape[1])]
     kinds = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
     lines = ["ply", f"format {LITTLE} 1.0"]
@@ -148,11 +149,6 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
         stream.write(header.content)
         for table in tables:
             stream.write(table.tobytes())
-
-
-def _harmonic_bytes(sh: Float[Tensor, "n k 3"]) -> np.ndarray:
-    """Rows of the table of harmonics."""
-    return bytes_of(((sh[:, 1:].transpose(1, 2).flatten(1) / SH_SPAN + 0.5) * 256).floor())
 
 
 def _bounded(

@@ -7,7 +7,7 @@ or bytes), ordered by degree, then channel.
 """
 
 import struct
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.scenes.packed import byte_opacities, floats, sh_of_colour
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.system.errors import FormatError
@@ -32,34 +32,13 @@ HARMONIC_RANGE = (-1.5, 1.5)  # of harmonics in bytes, if the file does not say
 MAX_DEGREE = 3
 
 name = "ksplat"
+sniff = by_name(".ksplat")  # the format has no magic number
 
 
-@dataclass(frozen=True)
-class Section:
-    """A section's header.
-
-    count, room: Gaussians, and records reserved.  capacity: Gaussians per bucket.  block: side of a bucket's cube.
-    full, partial: numbers of full and partly filled buckets.
-    """
-
-    count: int
-    room: int
-    capacity: int
-    buckets: int
-    block: float
-    bucket_size: int
-    range: int
-    full: int
-    partial: int
-    degree: int
-
-
+# A section's header.  count, room: Gaussians, and records reserved.  capacity: Gaussians per bucket.  block: side of a
+# bucket's cube.  full, partial: numbers of full and partly filled buckets.
+Section = namedtuple("Section", "count room capacity buckets block bucket_size range full partial degree")
 Records = tuple[Section, np.ndarray, np.ndarray]  # a section, its records, and the centre of each record's bucket
-
-
-def sniff(path: Path, head: bytes) -> bool:
-    """True for the suffix .ksplat; the format has no magic number."""
-    return path.suffix.lower() == ".ksplat"
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:

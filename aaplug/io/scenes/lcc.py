@@ -20,7 +20,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import Piece, byte_opacities, floats, fractions, rows_of, sh_of_colour, word_quats
-from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.io.values import Entry, entries, natural, object_of, read_bounded, read_json, text
@@ -42,11 +42,7 @@ CREDIT = "Data Organization Format originated from XGRIDS"  # its license asks t
 Read = Callable[[int, int], np.ndarray]  # of the rows of a table from start up to stop
 
 name = "lcc"
-
-
-def sniff(path: Path, head: bytes) -> bool:
-    """True for JSON with the suffix .lcc."""
-    return path.suffix.lower() == ".lcc" and head.lstrip().startswith(b"{")
+sniff = by_name(".lcc", start=b"{")
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:

@@ -75,7 +75,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     header = _header(document, first, count)
     with replacing(path, overwrite) as stream:
         stream.write(header.content)
-        stream.write(document.bytes_of(document.before))
+        stream.write(document.before())
         start, written = stream.tell(), 0
         for part in chain([first], parts):
             for at in range(0, len(part), ROWS_PER_WRITE):
@@ -84,7 +84,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
         size = start + written * header.vertex.dtype.itemsize
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
-        stream.write(document.bytes_of(document.after))
+        stream.write(document.after())
         if written != count:  # rows were left out: spaces replace digits that the number lost
             assert written < count
             stream.seek(0)

@@ -7,8 +7,9 @@ Functions raise FormatError for a file that breaks its format.
 
 import io
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,22 +59,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole file: its header, the Gaussians' table, and all other tables as little-endian bytes.
+    """A whole file: its header, the Gaussians' table, and what gives the other tables as little-endian bytes.
 
-    before, after: these bytes, or their place in the file (start, stop).
+    before, after: raise FormatError if the file is not there or was cut short.
     """
 
     header: Header
     table: Table | None = None
-    before: bytes | tuple[int, int] = b""
-    after: bytes | tuple[int, int] = b""
-
-    def bytes_of(self, content: bytes | tuple[int, int]) -> bytes:
-        """`before` or `after`, read; raises FormatError if the file is not there or was cut short."""
-        if isinstance(content, bytes):
-            return content
-        start, stop = content
-        return read_part(Path(self.header.path), start, stop - start) if start < stop else b""
+    before: Callable[[], bytes] = bytes
+    after: Callable[[], bytes] = bytes
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
@@ -87,11 +81,13 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
     vertex = header.vertex
     if header.coding == LITTLE and not any(e.lists for e in header.elements):
         start = header.start_of(vertex)
-        table = Table(path, start, vertex.count, vertex.dtype, stamp)
-        return Document(header, table, (header.size, start), (start + vertex.least_size, stamp[0]))
+        table, end = Table(path, start, vertex.count, vertex.dtype, stamp), start + vertex.least_size
+        places = (header.size, start), (end, stamp[0])
+        return Document(header, table, *(partial(read_part, path, a, b - a) if a < b else bytes for a, b in places))
     elements, at = _parsed(header), header.elements.index(vertex)
-    data, before, after = elements[at].data, _little(elements[:at]), _little(elements[at + 1 :])
-    return Document(header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after)
+    data, *others = elements[at].data, _little(elements[:at]), _little(elements[at + 1 :])
+    table = Table(path, 0, len(data), data.dtype, stamp, np.asarray(data))
+    return Document(header, table, *(partial(bytes, each) for each in others))
 
 
 def _parsed(header: Header) -> tuple[PlyElement, ...]:

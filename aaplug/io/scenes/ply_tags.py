@@ -24,7 +24,7 @@ from aaplug.io.ply_header import Header
 from aaplug.io.scenes.columns import FILTER_COLUMN
 from aaplug.io.scenes.record import Facts
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST
-from aaplug.io.values import HEAD_LIMIT, read_start
+from aaplug.io.values import start_of
 from aaplug.system.errors import FormatError
 
 RECORD = re.compile(r"aaplug\s+(?=fused=|convention=)(.*)")
@@ -158,16 +158,8 @@ def run_config(scene: Path, nerfstudio: bool = False) -> Facts | None:
         config, line = folder.parent / GSPLAT_CONFIG, GSPLAT_LINE
         if folder.name not in GSPLAT_FOLDERS:
             return None
-        if folder.name == "ckpts" and DISCS_LINE.search(_start_of(folder.parent / GSPLAT_DISCS)):
+        if folder.name == "ckpts" and DISCS_LINE.search(start_of(folder.parent / GSPLAT_DISCS)):
             return Facts(f"{GSPLAT_DISCS} of its run says 2D Gaussians (2DGS), treated as classic", flat=True)
-    values = {value.lower() for value in line.findall(_start_of(config))}
+    values = {value.lower() for value in line.findall(start_of(config))}
     convention = RUN_MODES.get(values.pop()) if len(values) == 1 else None  # the one value that all such lines have
     return None if convention is None else Facts(f"{config.name} of its run says {convention.name}", convention)
-
-
-def _start_of(config: Path) -> bytes:
-    """The first HEAD_LIMIT bytes; none if the file is not there, or cannot be read."""
-    try:
-        return read_start(config, HEAD_LIMIT)
-    except FormatError:
-        return b""

@@ -21,21 +21,16 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.columns import DEGREES
 from aaplug.io.scenes.ply_tags import run_config
 from aaplug.io.scenes.record import Facts
-from aaplug.io.scenes.rows import SceneFileOptions, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
-SUFFIXES = (".pt", ".pth", ".ckpt")
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 UNKNOWN = Facts("neither the format nor a cfg.yml or cfg.json in the folder above says: assumed classic")
 
 name = "pt"
-
-
-def sniff(path: Path, head: bytes) -> bool:
-    """True for the suffix of a checkpoint."""
-    return path.suffix.lower() in SUFFIXES
+sniff = by_name(".pt", ".pth", ".ckpt")
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:

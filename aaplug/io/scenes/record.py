@@ -72,13 +72,15 @@ def holdable(path: Path, part: Gaussians, format: str, degree: int, flat: bool =
 
 
 def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat: bool = False) -> Gaussians:
-    """All parts as one scene along a curve through space, for a format that sorts; raises as `holdable`.
-
-    The curve keeps neighbours together, which makes images compress and the bounds of chunks narrow.
-    """
+    """All parts as one scene; raises OutputError as `holdable`, and if there are no Gaussians."""
     scene = joined([holdable(path, part, format, degree, flat) for part in parts])
     if not len(scene):
         raise OutputError(path, f"a .{format} cannot hold a scene without Gaussians; write a .ply")
+    return scene
+
+
+def along_curve(scene: Gaussians) -> Gaussians:
+    """The scene along a curve that keeps neighbours together: images compress, and bounds of chunks are narrow."""
     return scene[curve(squeezed(scene.means.double())).argsort(stable=True)]
 
 

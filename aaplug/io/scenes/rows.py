@@ -1,6 +1,6 @@
 """Parts of every scene format: its options, errors of libraries as ours, rows of a table, the limit of a scene."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +48,11 @@ def library_errors(path: Path) -> Iterator[None]:
     except Exception as error:  # plyfile, numpy, zlib, zipfile, Pillow and torch raise all kinds
         what = " ".join(str(error).split())[:MAX_REASON]
         raise FormatError(path, f"is damaged and cannot be read: {what}") from error
+
+
+def by_name(*ends: str, start: bytes = b"") -> Callable[[Path, bytes], bool]:
+    """What recognizes files by the end of their names, and by their first bytes after white space."""
+    return lambda path, head: path.name.lower().endswith(ends) and head.lstrip().startswith(start)
 
 
 def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 0) -> np.ndarray:

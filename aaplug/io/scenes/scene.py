@@ -27,7 +27,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io import STREAM_INDEXES
 from aaplug.io.cameras import read_cameras, recognized
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes.faults import check_values, described_faults, faults_of, usable
+from aaplug.io.scenes.columns import check_values, described_faults, faults_of, usable
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.digests import digest_of_values

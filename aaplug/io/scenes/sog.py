@@ -41,7 +41,7 @@ from aaplug.io.scenes.packed import (
     replacing_group,
     without_largest,
 )
-from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, warn_of_moves, whole
+from aaplug.io.scenes.record import KEY, Facts, along_curve, read_record, record_of, warn_of_moves, whole
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, natural, number, object_of, parse_json, read_bounded
@@ -262,7 +262,7 @@ UNBUNDLED = _Unbundled()
 
 def encoded(path: Path, parts: Iterable[Gaussians]) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The meta.json of a scene, and its images by name; raises OutputError for what SOG cannot hold."""
-    scene = whole(path, parts, name, MOST_DEGREE, flat=True)
+    scene = along_curve(whole(path, parts, name, MOST_DEGREE, flat=True))
     logs = scene.means.double().sign() * scene.means.double().abs().log1p()
     least, most = logs.amin(dim=0), logs.amax(dim=0)
     span = torch.where(most > least, most - least, 1.0)

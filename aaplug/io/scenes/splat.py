@@ -14,7 +14,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, sh_of_colour
 from aaplug.io.scenes.record import holdable
-from aaplug.io.scenes.rows import SceneFileOptions, library_errors, read_rows
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError
 
@@ -25,11 +25,7 @@ EVIDENCE = "the format does not say: assumed classic (3DGS default)"
 
 name = "splat"
 needs = None
-
-
-def sniff(path: Path, head: bytes) -> bool:
-    """True for the suffix .splat."""
-    return path.suffix.lower() == ".splat"
+sniff = by_name(".splat")
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:

@@ -27,7 +27,7 @@ from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file, told_by_library
 from aaplug.io.cameras.usd import module
 from aaplug.io.scenes.packed import floats, half_turn_about_z, logit_of, of_degree, standing
-from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
+from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, parse_json
@@ -81,10 +81,7 @@ class UsdFormat:
         self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
     ) -> None:
         """Write a scene as one prim."""
-        scene = half_turn_about_z(joined([holdable(path, part, self.name, MAX_DEGREE) for part in parts]))
-        if not len(scene):
-            raise OutputError(path, f"a .{self.name} cannot hold a scene without Gaussians; write a .ply")
-        stage = _stage(scene)
+        stage = _stage(half_turn_about_z(whole(path, parts, self.name, MAX_DEGREE)))
         with replacing_file(path, overwrite, f".{self.name}") as temporary, told_by_library():
             if self.name != "usdz":
                 done = stage.GetRootLayer().Export(str(temporary))
