@@ -71,8 +71,17 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)
-    document = _document_of(first) or Document(_plain_header(first))
-    header = _header(document, first, count)
+    document, names = _document_of(first), [*matrix_of(first[:0])[0], *first.extras]
+    if document is None:  # a header as 3DGS writes it, with its order of columns
+        lines = [f"property float {c}" for c in (*names[:3], *NORMALS, *names[3:])]
+        start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(first)}"]
+        document = Document(parse("scene", [*start, *lines, "end_header"], "\n"))
+    old = document.header
+    spare = SCALES[2] if first.flat else None
+    dropped = [c for c in old.vertex.codes if _is_parameter(c) and c not in names and c != spare]
+    added = [column for column in names if column not in old.vertex.codes]
+    read = None if document.table is None else old
+    header = stating(old.rewritten(count, dropped, added), read, first.convention, first.fused)
     with replacing(path, overwrite) as stream:
         stream.write(header.content)
         stream.write(document.before())
@@ -177,24 +186,6 @@ def _matrix(rows: np.ndarray, names: Sequence[str]) -> Float[Tensor, "n c"]:
 
     matrix = structured_to_unstructured(rows[[*names]], np.float32)
     return torch.from_numpy(matrix.ravel().reshape(matrix.shape))  # of one row or none, ravel takes the odd stride away
-
-
-def _plain_header(scene: Gaussians) -> Header:
-    """The header that 3DGS writes, with its order of columns."""
-    names = [column for column in matrix_of(scene[:0])[0] if column != FILTER_COLUMN]  # `_header` adds that
-    properties = [f"property float {c}" for c in (*names[:3], *NORMALS, *names[3:], *scene.extras)]
-    start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
-    return parse("scene", [*start, *properties, "end_header"], "\n")
-
-
-def _header(document: Document, scene: Gaussians, count: int) -> Header:
-    """The document's header for this scene: count, columns, convention and fusions."""
-    old, (wanted, _) = document.header, matrix_of(scene[:0])
-    spare = SCALES[2] if scene.flat else None
-    dropped = [c for c in old.vertex.codes if _is_parameter(c) and c not in wanted and c != spare]
-    added = [column for column in (*wanted, *scene.extras) if column not in old.vertex.codes]
-    read = None if document.table is None else old
-    return stating(old.rewritten(count, dropped, added), read, scene.convention, scene.fused)
 
 
 def _document_of(scene: Gaussians) -> Document | None:

@@ -97,7 +97,11 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
     if convention.compensated or viewers.compensated:
         header = header.without_comments(lambda text: RENDER_MODE.fullmatch(text) or POSTSHOT_TAG.fullmatch(text))
     header = header.with_comments(["SplatRenderMode: mip"] * convention.compensated)
-    header = header.with_comments(_fused_line(fusion, convention) for fusion in fused)
+    for fusion in fused:
+        pairs = {"fused": fusion.method, **fusion.settings, "convention": convention.name}
+        assert pairs["fused"] == fusion.method, "a setting is called fused"
+        assert all(KEY.fullmatch(key) and WORD.fullmatch(value) for key, value in pairs.items()), pairs
+        header = header.with_comments(["aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items())])
     if meaning(header).convention != convention:  # no common tag says this
         header = header.with_comments([f"aaplug convention={convention.name}"])
     return header
@@ -132,15 +136,6 @@ def _matches(header: Header, pattern: re.Pattern[str]) -> list[str]:
 
 def _last(header: Header, pattern: re.Pattern[str]) -> str | None:
     return (_matches(header, pattern) or [None])[-1]
-
-
-def _fused_line(fusion: Fusion, convention: Convention) -> str:
-    pairs = {"fused": fusion.method, **fusion.settings, "convention": convention.name}
-    assert pairs["fused"] == fusion.method, "a setting is called fused"
-    for key, value in pairs.items():
-        assert KEY.fullmatch(key), key
-        assert WORD.fullmatch(value), value
-    return "aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items())
 
 
 def run_config(scene: Path, nerfstudio: bool = False) -> Facts | None:

@@ -42,7 +42,7 @@ from aaplug.io.scenes.packed import (
     without_largest,
 )
 from aaplug.io.scenes.record import KEY, Facts, along_curve, read_record, record_of, warn_of_moves, whole
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, natural, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
@@ -218,14 +218,11 @@ def _rows(
     largest = torch.from_numpy(turns[:, 3].astype(np.int64)) - W_LARGEST
     unit = largest_last((floats(turns[:, :3]) / 255 - 0.5) * 2**0.5, largest.clamp(min=0))
     unit = torch.where(largest[:, None] < 0, torch.tensor([1.0, 0.0, 0.0, 0.0]), unit)
-    return Gaussians(_means(means, rows), unit, log_scales, logits, sh)
-
-
-def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
-    low, high = (part.pixels[i][rows, :3].astype(np.float64) for i in range(2))
-    least, most = part.entry.vector("mins", 3), part.entry.vector("maxs", 3)
+    low, high = (means.pixels[i][rows, :3].astype(np.float64) for i in range(2))
+    least, most = means.entry.vector("mins", 3), means.entry.vector("maxs", 3)
     span = torch.where(most == least, 1.0, most - least)
-    return _unsquashed(least + span * torch.from_numpy((low + 256 * high) / 65535)).float()
+    centres = _unsquashed(least + span * torch.from_numpy((low + 256 * high) / 65535)).float()
+    return Gaussians(centres, unit, log_scales, logits, sh)
 
 
 def _unsquashed(logs: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -250,11 +247,7 @@ class _Unbundled:
     """The meta.json of a folder; it is read as `sog`."""
 
     name, needs, keeps, read_as = META, None, keeps, name
-    open_scene, write = staticmethod(open_scene), staticmethod(write)
-
-    @staticmethod
-    def sniff(path: Path, head: bytes) -> bool:
-        return False
+    sniff, open_scene, write = staticmethod(by_name()), staticmethod(open_scene), staticmethod(write)
 
 
 UNBUNDLED = _Unbundled()

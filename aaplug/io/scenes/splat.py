@@ -5,6 +5,7 @@ header, no harmonics above degree 0, and does not say how the scene was trained,
 """
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +37,18 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         what = f"has {size:,} bytes, which is not a multiple of {RECORD.itemsize}"
         raise FormatError(path, f"{what}; it is cut short or not a .splat")
     count = size // RECORD.itemsize
-    return Scene(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
+    return Scene(path, name, count, 0, partial(_rows, path), EVIDENCE)
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost, as a warning says."""
     with replacing(path, overwrite) as stream:
         for part in parts:
-            stream.write(_records(holdable(path, part, name, MOST_DEGREE)).tobytes())
+            scene, records = holdable(path, part, name, MOST_DEGREE), np.zeros(len(part), RECORD)
+            records["means"], records["scales"] = scene.means.numpy(), scene.scales.numpy()
+            records["rgba"] = bytes_of(torch.cat([scene.base_colours, scene.opacities[:, None]], dim=1) * 255)
+            records["quats"] = bytes_of(scene.unit_quats * ZERO_BYTE + ZERO_BYTE)
+            stream.write(records.tobytes())
         if not stream.tell():
             raise OutputError(path, "cannot hold a scene without Gaussians; write a .ply")
 
@@ -54,13 +59,3 @@ def _rows(path: Path, start: int, stop: int) -> Gaussians:
     means, quats = floats(records["means"]), (floats(records["quats"]) - ZERO_BYTE) / ZERO_BYTE
     sh = sh_of_colour(floats(rgba[:, :3]) / 255)[:, None]
     return Gaussians(means, quats, floats(records["scales"]).log(), byte_opacities(rgba[:, 3]), sh)
-
-
-def _records(scene: Gaussians) -> np.ndarray:
-    records = np.zeros(len(scene), RECORD)
-    rgb = scene.base_colours
-    rgba = torch.cat([rgb, scene.opacities[:, None]], dim=1)
-    records["means"] = scene.means.numpy()
-    records["scales"] = scene.scales.numpy()
-    records["rgba"], records["quats"] = bytes_of(rgba * 255), bytes_of(scene.unit_quats * ZERO_BYTE + ZERO_BYTE)
-    return records

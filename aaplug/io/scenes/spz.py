@@ -125,7 +125,15 @@ def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | Non
     """A file's header, its sections with a row per Gaussian, and the axes that it states; or those of a part of it."""
     zipped = data.startswith(GZIP_SIGNATURE)
     head = zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
-    header = _header(path, head)
+    if len(head) < HEADER.size or not head.startswith(MAGIC):
+        raise FormatError(path, "is not an .spz: its header is missing")
+    _, version, count, degree, fraction, flags, _ = HEADER.unpack(head)
+    if not FIRST_VERSION <= version <= STREAMS_VERSION:
+        raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS_VERSION}")
+    if degree > MAX_DEGREE or fraction > MAX_FRACTION:
+        raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
+    check_count(path, count)
+    header = Header(version, count, degree, fraction, flags)
     sizes = [width * header.count for width in header.widths]
     if header.version >= STREAMS_VERSION:
         if zipped:
@@ -163,18 +171,6 @@ def _axes(path: Path, records: bytes) -> str | None:
             found = AXES[number] or None
         at += length
     return found
-
-
-def _header(path: Path, data: bytes) -> Header:
-    if len(data) < HEADER.size or not data.startswith(MAGIC):
-        raise FormatError(path, "is not an .spz: its header is missing")
-    _, version, count, degree, fraction, flags, _ = HEADER.unpack(data)
-    if not FIRST_VERSION <= version <= STREAMS_VERSION:
-        raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS_VERSION}")
-    if degree > MAX_DEGREE or fraction > MAX_FRACTION:
-        raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
-    check_count(path, count)
-    return Header(version, count, degree, fraction, flags)
 
 
 def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
@@ -216,7 +212,11 @@ def rows(header: Header, sections: list[np.ndarray], axes: str, start: int, stop
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
     sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
     if header.version >= WORD_QUATERNIONS_VERSION:
-        unit = _threes(quats)
+        words = np.ascontiguousarray(quats).view("<u4")[:, 0].astype(np.int64)  # 2 bits for the largest, 10 for others
+        fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
+        signed = (fields & MAGNITUDE_MASK) * np.where(fields > MAGNITUDE_MASK, -1, 1)
+        xyzw = largest_last(floats(signed) / MAGNITUDE_MASK / 2**0.5, torch.from_numpy(words >> 30))
+        unit = xyzw.roll(1, dims=1)
     else:  # x, y, z; w follows and is not negative
         unit = largest_last(floats(quats) / 127.5 - 1, torch.zeros(n))
     if header.version == FIRST_VERSION:
@@ -232,16 +232,6 @@ def rows(header: Header, sections: list[np.ndarray], axes: str, start: int, stop
 def _turned(scene: Gaussians, axes: str) -> Gaussians:
     """The scene from these axes to OpenCV's, RDF, or back."""
     return scene if axes == "RDF" else mirrored(scene, [1.0 if axis in "RDF" else -1.0 for axis in axes])
-
-
-def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
-    """2 bits for the index of the largest component (xyzw), then 10 bits for each of the others."""
-    words = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
-    fields = [(words >> shift) & 1023 for shift in (20, 10, 0)]
-    parts = [(f & MAGNITUDE_MASK) * np.where(f > MAGNITUDE_MASK, -1, 1) for f in fields]
-    rest = floats(np.stack(parts, axis=1)) / MAGNITUDE_MASK / 2**0.5
-    xyzw = largest_last(rest, torch.from_numpy(words >> 30))
-    return xyzw[:, [3, 0, 1, 2]]
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:

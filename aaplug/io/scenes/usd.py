@@ -66,7 +66,15 @@ class UsdFormat:
         """All prims of splats as one scene, in memory; read by `usd_child`."""
         check_installed(PACKAGE, self.extra, "path", f"{path.suffix} files need the extra `usd`")
         with library_errors(path), scratch() as folder:
-            told, arrays = _told(path, folder / "arrays.npz")
+            command = [sys.executable, str(CHILD), str(path.resolve()), str(file := folder / "arrays.npz")]
+            seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
+            try:
+                run = subprocess.run(command, capture_output=True, timeout=seconds, check=True)
+            except (subprocess.SubprocessError, ValueError) as error:
+                raise FormatError(path, "cannot be read: it breaks the format of USD") from error
+            told = parse_json(run.stdout.splitlines()[-1], path)
+            with np.load(file) as loaded:
+                arrays = dict(loaded)
             if "refused" in told:
                 raise FormatError(path, told["refused"])
             parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(told["prims"])]
@@ -96,18 +104,6 @@ class UsdFormat:
 
 
 FORMATS = tuple(UsdFormat(suffix) for suffix in SUFFIXES)
-
-
-def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    """The child's answer about a file, and the arrays that it leaves."""
-    command = [sys.executable, str(CHILD), str(path.resolve()), str(file)]
-    seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
-    try:
-        run = subprocess.run(command, capture_output=True, timeout=seconds, check=True)
-    except (subprocess.SubprocessError, ValueError) as error:
-        raise FormatError(path, "cannot be read: it breaks the format of USD") from error
-    with np.load(file) as arrays:
-        return parse_json(run.stdout.splitlines()[-1], path), dict(arrays)
 
 
 def _read(path: Path, prim: dict[str, Any], number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
