@@ -109,7 +109,7 @@ from aaplug.evaluation.laws.base import make_scene
 from aaplug.io.scenes import ply, read_scene, scene, write_scene
 from aaplug.io.scenes.scene import without_harmonics
 scene.MAX_HARMONICS_BYTES = 0
-ply.ROWS_PER_PART = 5_000
+ply.PART = 5_000
 small = Path({path!r})
 path = small.with_name("large.ply")
 write_scene(path, make_scene({count}, degree=3))

@@ -8,7 +8,7 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -94,16 +94,13 @@ class Header:
         """Where a table begins in the file, if the tables before it have no lists."""
         return self.size + sum(e.least_size for e in self.elements[: self.elements.index(element)])
 
-    def without_comments(self, unwanted: Callable[[str], object]) -> "Header":
-        """The header without the comments for which `unwanted` is true."""
-        lines = (x for x in self.lines if _keyword(x) != "comment" or not unwanted(_comment(x)))
+    def commented(self, added: Iterable[str], dropped: Collection[re.Pattern[str]] = ()) -> "Header":
+        """The header without comments of these patterns, and with others before the first element."""
+        unwanted = {c for c in self.comments if any(pattern.fullmatch(c) for pattern in dropped)}
+        lines = [x for x in self.lines if _keyword(x) != "comment" or _comment(x) not in unwanted]
+        first = next(i for i, x in enumerate(lines) if _keyword(x) in ("element", "end_header"))
+        lines[first:first] = [f"comment {comment}" for comment in added]
         return parse(self.path, lines, self.newline)
-
-    def with_comments(self, comments: Iterable[str]) -> "Header":
-        """The header with comments added before the first element."""
-        first = next(i for i, x in enumerate(self.lines) if _keyword(x) in ("element", "end_header"))
-        added = [f"comment {comment}" for comment in comments]
-        return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
     def rewritten(self, count: int | str, dropped: Collection[str] = (), added: Iterable[str] = ()) -> "Header":
         """The header of a little-endian file with `count` vertices, without some columns, with others (float) added."""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from itertools import accumulate
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -124,11 +125,11 @@ def rad_of(tree: Tree) -> bytes:
 
 def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
     """The ranges of Spark's 8 bits: of colours all of 0 to 1, of scales up to the largest, which the tree rests on."""
-    colours = scene.base_colours
-    spans = {"rgbMin": min(0.0, _quantile(colours, 1 - SPANNED)), "rgbMax": max(1.0, _quantile(colours, SPANNED))}
-    spans |= {"lnScaleMin": _quantile(scene.log_scales, 1 - SPANNED), "lnScaleMax": float(scene.log_scales.max())}
+    low, high = np.quantile(scene.base_colours, (1 - SPANNED, SPANNED)).tolist()
+    least, most = float(np.quantile(scene.log_scales, 1 - SPANNED)), float(scene.log_scales.max())
+    spans = {"rgbMin": min(0.0, low), "rgbMax": max(1.0, high), "lnScaleMin": least, "lnScaleMax": most}
     for band, coefficients in enumerate(BANDS[:degree], 1):
-        spans[f"sh{band}Max"] = max(MIN_SPAN, _quantile(scene.sh[:, coefficients].abs(), SPANNED))
+        spans[f"sh{band}Max"] = max(MIN_SPAN, float(np.quantile(scene.sh[:, coefficients].abs(), SPANNED)))
     return spans | {"lodOpacity": True}
 
 
@@ -165,11 +166,6 @@ def _properties(tree: Tree, spans: Mapping[str, float]) -> dict[str, tuple[str, 
     properties["child_count"] = "u16", tree.counts.to(torch.uint16)
     properties["child_start"] = "u32", tree.starts.to(torch.uint32)
     return properties
-
-
-def _quantile(values: Tensor, share: float) -> float:
-    """The value that so large a share of the values lies below."""
-    return float(values.flatten().kthvalue(max(1, round(share * values.numel()))).values)
 
 
 def _headed(magic: bytes, header: Mapping[str, Any]) -> bytes:

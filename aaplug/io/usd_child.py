@@ -21,16 +21,6 @@ ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:spherica
 MEMORY, GROWTH = 2 * 2**30, 20  # bytes of address space beside so many times the file's size
 
 
-def limit_memory(path: str) -> None:
-    """Let a file that announces more than it can hold fail here."""
-    with suppress(ImportError, ValueError, OSError):
-        import resource
-
-        most = MEMORY + GROWTH * os.path.getsize(path)
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
-
-
 def layers_of(path: str) -> Iterator[tuple[str, str]]:
     """The layers that a stage is composed with, as their files name them, and their files; each is opened after that.
 
@@ -88,7 +78,11 @@ def found_in(path: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    limit_memory(sys.argv[1])
+    with suppress(ImportError, ValueError, OSError):  # a file that announces more than it can hold fails here
+        import resource
+
+        most, (_, hard) = MEMORY + GROWTH * os.path.getsize(sys.argv[1]), resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
     read: dict[str, np.ndarray] = {}
     answer = found_in(sys.argv[1], read)
     np.savez(sys.argv[2], allow_pickle=False, **read)

@@ -27,7 +27,7 @@ from aaplug.io.scenes.packed import sh_of_colour
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
-from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes.scene import PART, Scene
 from aaplug.system.errors import FormatError, OutputError, counted, listing
 
 REST = re.compile(r"f_rest_\d+")
@@ -39,7 +39,6 @@ NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expec
 EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
 UP_AXIS = re.compile(r"vertical axis\s*:\s*[xyz+-]+", re.IGNORECASE)  # a comment of nerfstudio and Brush, for viewers
 MOST_NAMED = 24  # columns in a message
-ROWS_PER_PART = 1 << 16  # 16 MB of a scene of degree 3: few calls, and little memory beside the result
 ROWS_PER_WRITE = 1 << 13  # 2 MB, so that a column's stride stays within the cache
 
 name = "ply"
@@ -158,8 +157,8 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
     """The parameters as tensors, converted part by part, so that memory holds all of them once."""
     part = _part(document, degree, flat, start, start)  # none, which has the columns
     whole = {name: x.new_empty(stop - start, *x.shape[1:]) for name, x in {**part.columns, **part.extras}.items()}
-    for begin in range(start, stop, ROWS_PER_PART):
-        part = _part(document, degree, flat, begin, min(begin + ROWS_PER_PART, stop))
+    for begin in range(start, stop, PART):
+        part = _part(document, degree, flat, begin, min(begin + PART, stop))
         for name, column in {**part.columns, **part.extras}.items():
             whole[name][begin - start :][: len(part)] = column
     columns = {name: whole[name] for name in part.columns}

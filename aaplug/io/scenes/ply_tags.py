@@ -89,21 +89,21 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
     said = [(m.convention, m.fused) for m in (meaning(each) for each in (header, read) if each)]
     if read and all(each == (convention, fused) for each in said):
         return header
-    header = header.without_comments(RECORD.fullmatch)
+    dropped, added = [RECORD], ["SplatRenderMode: mip"] * convention.compensated
     mode, postshot = _last(header, RENDER_MODE), _last(header, POSTSHOT_TAG)
     viewers = ANTIALIASED if postshot == "1" else CLASSIC
     if mode is not None:
         viewers = MODES.get(mode.lower(), CLASSIC)
     if convention.compensated or viewers.compensated:
-        header = header.without_comments(lambda text: RENDER_MODE.fullmatch(text) or POSTSHOT_TAG.fullmatch(text))
-    header = header.with_comments(["SplatRenderMode: mip"] * convention.compensated)
+        dropped += [RENDER_MODE, POSTSHOT_TAG]
     for fusion in fused:
         pairs = {"fused": fusion.method, **fusion.settings, "convention": convention.name}
         assert pairs["fused"] == fusion.method, "a setting is called fused"
         assert all(KEY.fullmatch(key) and WORD.fullmatch(value) for key, value in pairs.items()), pairs
-        header = header.with_comments(["aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items())])
+        added.append("aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items()))
+    header = header.commented(added, dropped)
     if meaning(header).convention != convention:  # no common tag says this
-        header = header.with_comments([f"aaplug convention={convention.name}"])
+        header = header.commented([f"aaplug convention={convention.name}"])
     return header
 
 

@@ -106,9 +106,7 @@ class Scene:
         check_values(held.scene if isinstance(held, Pyramid) else held)
         finest, levels = (held.finest, held) if isinstance(held, Pyramid) else (held, None)
         facts = finest.convention, finest.fused, finest.flat
-        format, evidence, document = "", "", None
-        if (origin := finest.origin) is not None:
-            format, evidence, document = origin.format, origin.evidence, origin.document
+        format, evidence, document = (o.format, o.evidence, o.document) if (o := finest.origin) else ("", "", None)
         format = format if levels is None else "levels"
         scene = cls(None, format, len(finest), finest.sh_degree, partial(held_rows, finest), evidence, *facts, document)
         scene.memory.update(gaussians=finest, levels=levels)

@@ -150,28 +150,23 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     files = entry.value("files")
     wanted = 2 if key in ("means", "shN") else 1
     entry.place.expect(isinstance(files, list) and len(files) == wanted, "files", f"{wanted} names", files)
-    images = []
-    for index, file in enumerate(files):
+    images = list[np.ndarray]()
+    for file in files:
         plain = isinstance(file, str) and bool(FILE_NAME.fullmatch(file))
         entry.place.expect(plain, "files", "names of plain files beside meta.json", file)
-        palette = key == "shN" and index == 0
-        noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
-        images.append(_image(path, file, fetch, None if palette else count, noisy))
+        palette = key == "shN" and not images
+        least, most = (1, MAX_PALETTE_PIXELS) if palette else (max(1, count), 2 * count + SPARE_PIXELS)
+        data = fetch(file, BYTES_PER_PIXEL * most + whole_limit("SLACK"))
+        if key == "means" and not images:  # low bytes do not compress: the size tells the count
+            check_growth(path, BYTES_PER_PIXEL * count, len(data))
+        # Pillow warns about large images; the check below is stricter
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+            width, height = image.size
+            if not least <= width * height <= most:
+                wanted = most if palette else count
+                raise FormatError(path, f"{file} has {width}x{height} px, and {wanted:,} are wanted")
+            images.append(np.asarray(image.convert("RGBA")))
     return Part(entry, [image.reshape(-1, BYTES_PER_PIXEL) for image in images], images[0].shape[1])
-
-
-def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> np.ndarray:
-    """RGBA of a lossless WebP, [height, width, 4]; refuses more pixels than `count` Gaussians need."""
-    most = 2 * count + SPARE_PIXELS if count is not None else MAX_PALETTE_PIXELS
-    data = fetch(file, BYTES_PER_PIXEL * most + whole_limit("SLACK"))
-    if noisy:
-        check_growth(path, BYTES_PER_PIXEL * (count or 0), len(data))
-    # Pillow warns about large images; the check below is stricter
-    with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-        width, height = image.size
-        if width * height > most or width * height < (count or 1):
-            raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
-        return np.asarray(image.convert("RGBA"))
 
 
 def _meaning(meta: dict[str, Any]) -> Facts:
