@@ -253,11 +253,12 @@ def write_index(
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, parts, rate)
         if middle is not None and name == "3dtiles":
             index["root"]["transform"][12:15] = (0.0 - middle[TILE_AXES]).tolist()  # no -0.0
-        content = _json(index)
+        content = json.dumps(index, indent=1).encode()
         if name == "sog":
             settings["app.scene.gsplat"]["antiAlias"] = compensated
     view = {name: getattr(frame, name).tolist() for name in ("up", "front", "centre")} | {"radius": frame.radius}
-    write_file(folder / SETTINGS, _json({**settings, "levels": levels, "view": view}), overwrite=True)
+    told = json.dumps({**settings, "levels": levels, "view": view}, indent=1).encode()
+    write_file(folder / SETTINGS, told, overwrite=True)
     write_file(folder / stream.index, content, overwrite=True)  # last: it is the mark
     return settings
 
@@ -268,10 +269,6 @@ def level_count(folder: Path, name: StreamName) -> int:
         return 0
     settings = object_of(read_json(folder / SETTINGS), folder / SETTINGS, "the settings", "'levels'", "levels")
     return natural(settings.value("levels"), settings.place, "levels", MAX_GAUSSIANS)
-
-
-def _json(value: Mapping[str, Any]) -> bytes:
-    return json.dumps(value, indent=1).encode()
 
 
 def _read_parts(folder: Path, stream: Stream, level: int) -> Float[Tensor, "leaves 7"]:
@@ -321,6 +318,9 @@ Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's se
 
 
 def _lod_meta(stream: Stream, parts: Float[Tensor, "levels leaves 7"], rate: float) -> Indexed:
+    def bound(some: Float[Tensor, "*n 7"]) -> dict[str, list[float]]:
+        return dict(zip(("min", "max"), _box(some).tolist(), strict=True))
+
     counts, filenames, children = parts[..., 0].sum(dim=1).long().tolist(), [], []
     for leaf, levels in enumerate(parts.unbind(dim=1)):
         lods = {}
@@ -328,8 +328,8 @@ def _lod_meta(stream: Stream, parts: Float[Tensor, "levels leaves 7"], rate: flo
             if part[0]:
                 lods[str(number)] = {"file": len(filenames), "offset": 0, "count": int(part[0])}
                 filenames.append(stream.part(number, leaf))
-        children.append({"bound": _bound(_box(levels)), "lods": lods})
-    tree = {"bound": _bound(_box(parts)), "children": children}
+        children.append({"bound": bound(levels), "lods": lods})
+    tree = {"bound": bound(parts), "children": children}
     facts = {"version": 1, "asset": {"generator": "aaplug"}, "count": counts[0], "counts": counts}
     settings = {
         "app.scene.gsplat": {"antiAlias": True, "splatBudgetMode": "limit", "splatBudget": 0},
@@ -384,10 +384,6 @@ def _spark_settings(front: Front) -> dict[str, Any]:
 def _box(parts: Float[Tensor, "*n 7"]) -> Box:
     """The box around the boxes of parts."""
     return torch.stack([parts[..., 1:4].reshape(-1, 3).amin(dim=0), parts[..., 4:].reshape(-1, 3).amax(dim=0)])
-
-
-def _bound(box: Box) -> dict[str, list[float]]:
-    return {"min": box[0].tolist(), "max": box[1].tolist()}
 
 
 def _volume(box: Box) -> dict[str, list[float]]:

@@ -179,8 +179,10 @@ def read_scene(
         return replace(scene, folder=given, frames=frames, others=frames.paths[1:], notes=notes)
     if manifest is not None:
         others = (given / MANIFEST, *(given / level.file for level in manifest.levels[1:]))
-        notes = (*scene.notes, manifest.described)
-        return replace(scene, folder=given, read_levels=partial(read_pyramid, given), others=others, notes=notes)
+        counts, rate = " > ".join(f"{sum(level.chunks):,}" for level in manifest.levels), manifest.levels[-1].rate
+        about = f"{len(manifest.levels)} levels of detail: {counts} Gaussians, down to {rate:.3g} × training"
+        read, notes = partial(read_pyramid, given), (*scene.notes, about)
+        return replace(scene, folder=given, read_levels=read, others=others, notes=notes)
     return scene
 
 

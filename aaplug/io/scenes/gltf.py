@@ -54,10 +54,7 @@ def harmonics(degree: int) -> list[str]:
 
 @dataclass(frozen=True)
 class GltfFormat:
-    """Files of one suffix.
-
-    Raises as `SceneFormat` and `WritableFormat`.
-    """
+    """Files of one suffix.  Raises as `SceneFormat` and `WritableFormat`."""
 
     name: str
     needs: str | None = None

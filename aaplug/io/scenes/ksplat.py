@@ -8,13 +8,14 @@ or bytes), ordered by degree, then channel.
 
 import struct
 from collections import namedtuple
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.packed import byte_opacities, floats, sh_of_colour
+from aaplug.io.scenes.packed import byte_opacities, floats, of_degree, sh_of_colour
 from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -38,45 +39,39 @@ sniff = by_name(".ksplat")  # the format has no magic number
 # A section's header.  count, room: Gaussians, and records reserved.  capacity: Gaussians per bucket.  block: side of a
 # bucket's cube.  full, partial: numbers of full and partly filled buckets.
 Section = namedtuple("Section", "count room capacity buckets block bucket_size range full partial degree")
-Records = tuple[Section, np.ndarray, np.ndarray]  # a section, its records, and the centre of each record's bucket
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
-        data = path.read_bytes()
-        level, sh_range, sections = _sections(path, data)
-        count = sum(section.count for section, *_ in sections)
-        degree = max((section.degree for section, *_ in sections), default=0)
+        data, parts = path.read_bytes(), list[Gaussians]()
+        if len(data) < MAIN_SIZE:
+            raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")
+        major, minor, number, count, level, *ends = MAIN.unpack_from(data)
+        if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
+            raise FormatError(path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2")
+        check_count(path, count)
+        at = MAIN_SIZE + number * SECTION_SIZE
+        if at > len(data):
+            raise FormatError(path, f"promises {number:,} sections, more than it can hold")
+        for index in range(number):
+            section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
+            part, at = _decoded(path, data, at, section, level, ends)
+            parts.append(part)
+        if sum(map(len, parts)) != count:
+            raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
+        degree = max((part.sh_degree for part in parts if len(part)), default=0)
         none = torch.zeros(0, 3)
         empty = Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), torch.zeros(0, (degree + 1) ** 2, 3))
-        scene = joined([empty, *(_decoded(records, level, sh_range, degree) for records in sections)])
+        scene = joined([empty, *(of_degree(part, degree) for part in parts)])
     notes = (f"compression level {level}",)
     return Scene(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
 
 
-def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[Records]]:
-    if len(data) < MAIN_SIZE:
-        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")
-    major, minor, number, count, level, least, most = MAIN.unpack_from(data)
-    if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
-        raise FormatError(path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2")
-    check_count(path, count)
-    at = MAIN_SIZE + number * SECTION_SIZE
-    if at > len(data):
-        raise FormatError(path, f"promises {number:,} sections, more than it can hold")
-    sections = []
-    for index in range(number):
-        section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
-        records, at = _records(path, data, at, section, level)
-        if section.count:
-            sections.append(records)
-    if sum(section.count for section, *_ in sections) != count:
-        raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
-    return level, (least or HARMONIC_RANGE[0], most or HARMONIC_RANGE[1]), sections
-
-
-def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> tuple[Records, int]:
+def _decoded(
+    path: Path, data: bytes, at: int, section: Section, level: int, ends: Sequence[float]
+) -> tuple[Gaussians, int]:
+    """The Gaussians of the section that begins at a byte, and where it ends.  ends: of harmonics; 0 if unsaid."""
     rest = 3 * ((section.degree + 1) ** 2 - 1)
     shape, position, harmonic = SHAPE_TYPES[level], POSITION_TYPES[level], HARMONIC_TYPES[level]
     fields = [("means", position, 3), ("scales", shape, 3), ("quats", shape, 4), ("rgba", "u1", 4)]
@@ -91,31 +86,25 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
     if wrong:
         raise FormatError(path, f"has a damaged section at byte {at:,}: {section}")
     rows = np.frombuffer(data, record, section.count, start)
-    if not level:
-        return (section, rows, np.zeros((len(rows), 3), np.float32)), end
-    full = np.full(section.full, section.capacity, np.int64)
-    partial = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
-    fill = np.minimum(np.concatenate([full, partial]), section.count)
-    if fill.sum() < section.count:
-        raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
-    bucket = np.searchsorted(np.cumsum(fill), np.arange(section.count), side="right")
-    centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
-    return (section, rows, centres[bucket]), end
-
-
-def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree: int) -> Gaussians:
-    section, rows, centres = records
     means = rows["means"].astype(np.float64)
     if level:
+        full = np.full(section.full, section.capacity, np.int64)
+        partial = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
+        fill = np.minimum(np.concatenate([full, partial]), section.count)
+        if fill.sum() < section.count:
+            raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
+        bucket = np.searchsorted(np.cumsum(fill), np.arange(section.count), side="right")
+        centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
         steps = section.range or POSITION_RANGES[level]
-        means = (means - steps) * (section.block / 2 / steps) + centres
-    sh = torch.zeros(len(rows), (degree + 1) ** 2, 3)
+        means = (means - steps) * (section.block / 2 / steps) + centres[bucket]
+    sh = torch.zeros(len(rows), (section.degree + 1) ** 2, 3)
     sh[:, 0] = sh_of_colour(floats(rows["rgba"][:, :3]) / 255)
-    rest = floats(rows["sh"])
+    values = floats(rows["sh"])
     if level == len(HARMONIC_TYPES) - 1:
-        rest = sh_range[0] + rest / 255 * (sh_range[1] - sh_range[0])
+        least, most = (end or usual for end, usual in zip(ends, HARMONIC_RANGE, strict=True))
+        values = least + values / 255 * (most - least)
     for d in range(1, section.degree + 1):
-        band = rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
+        band = values[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
         sh[:, d * d : (d + 1) ** 2] = band.reshape(len(rows), 3, 2 * d + 1).transpose(1, 2)
     opacities = byte_opacities(rows["rgba"][:, 3])
-    return Gaussians(floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), opacities, sh)
+    return Gaussians(floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), opacities, sh), end

@@ -48,12 +48,6 @@ class Manifest:
     count: int
     levels: tuple[LevelFile, ...]
 
-    @property
-    def described(self) -> str:
-        """In words."""
-        counts = " > ".join(f"{sum(level.chunks):,}" for level in self.levels)
-        return f"{len(self.levels)} levels of detail: {counts} Gaussians, down to {self.levels[-1].rate:.3g} × training"
-
 
 def is_pyramid(folder: AnyPath) -> bool:
     """True for a folder that holds a pyramid, finished or not."""

@@ -16,6 +16,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -92,13 +93,26 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
-    with library_errors(path):
-        if _is_meta(path):
-            meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
-            return _scene(path, meta, partial(_from_folder, path))
-        with zipfile.ZipFile(path) as archive:
-            meta = parse_json(_from_zip(path, archive, META, whole_limit("JSON")), path)
-            return _scene(path, meta, partial(_from_zip, path, archive))
+    with library_errors(path), nullcontext() if _is_meta(path) else zipfile.ZipFile(path) as archive:
+        fetch = partial(_from_folder, path) if archive is None else partial(_from_zip, path, archive)
+        meta = parse_json(fetch(META if archive else path.name, whole_limit("JSON")), path)
+        root = object_of(meta, path, META, "means, scales, quats and sh0")
+        version = root.fields.get("version", 1)
+        right = version in (1, 2) and (version == 2) == ("version" in meta)
+        root.place.expect(right, "version", "2, or left out", version)
+        value = root.value("count") if version > 1 else root.entry("means").fields.get("shape", [0])
+        value = value[0] if isinstance(value, list) and value else value
+        count = natural(value, root.place, "count", MAX_COUNT)
+        check_count(path, count)
+        used = ["means", "quats", "scales", "sh0", *["shN"] * bool(meta.get("shN"))]
+        parts = {key: _part(path, root, key, count, fetch) for key in used}
+        palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
+        facts = read_record(path, meta, _meaning(meta))
+    degree = round((palette.shape[1] + 1) ** 0.5) - 1
+    load, notes = partial(_rows, parts, palette, version, facts.flat), (f"version {version}",)
+    files = [file for part in parts.values() for file in part.entry.value("files")] if _is_meta(path) else []
+    others = tuple(path.parent / file for file in files)
+    return Scene(path, name, count, degree, load, *facts, notes=notes, others=others)
 
 
 def _is_meta(path: Path) -> bool:
@@ -124,25 +138,6 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
         raise FormatError(path, f"{file} has {inside[0].file_size:,} bytes, more than {most:,}")
     with archive.open(inside[0]) as stream:
         return stream.read(most + 1)
-
-
-def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
-    root = object_of(meta, path, META, "means, scales, quats and sh0")
-    version = root.fields.get("version", 1)
-    root.place.expect(version in (1, 2) and (version == 2) == ("version" in meta), "version", "2, or left out", version)
-    value = root.value("count") if version > 1 else root.entry("means").fields.get("shape", [0])
-    value = value[0] if isinstance(value, list) and value else value
-    count = natural(value, root.place, "count", MAX_COUNT)
-    check_count(path, count)
-    used = ["means", "quats", "scales", "sh0", *["shN"] * bool(meta.get("shN"))]
-    parts = {key: _part(path, root, key, count, fetch) for key in used}
-    palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
-    degree = round((palette.shape[1] + 1) ** 0.5) - 1
-    facts = read_record(path, meta, _meaning(meta))
-    load, notes = partial(_rows, parts, palette, version, facts.flat), (f"version {version}",)
-    files = [file for part in parts.values() for file in part.entry.value("files")] if _is_meta(path) else []
-    others = tuple(path.parent / file for file in files)
-    return Scene(path, name, count, degree, load, *facts, notes=notes, others=others)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
