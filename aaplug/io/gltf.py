@@ -8,7 +8,7 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -48,31 +48,7 @@ class Buffer:
         return read_part(self.path, at, size) if self.held is None else self.held[at : at + size]
 
 
-@dataclass(frozen=True)
-class Accessor:
-    """A table of numbers in a buffer.
-
-    stride: bytes from a row to the next.  most: the integer that stands for 1; None where numbers are as they are.
-    """
-
-    place: Place
-    buffer: Buffer
-    start: int
-    stride: int
-    dtype: np.dtype
-    width: int
-    count: int
-    most: int | None
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """The rows from start up to stop, as float32."""
-        rows, item = stop - start, self.width * self.dtype.itemsize
-        if rows <= 0:
-            return np.zeros((0, self.width), np.float32)
-        data = self.buffer.read(self.start + start * self.stride, (rows - 1) * self.stride + item)
-        table = np.ndarray((rows, self.width), self.dtype, data, 0, (self.stride, self.dtype.itemsize))
-        values = table.astype(np.float32)
-        return values if self.most is None else np.maximum(values / self.most, -1)
+Table = tuple[int, Callable[[int, int], np.ndarray]]  # its rows, and what reads those from start up to stop as float32
 
 
 class Gltf:
@@ -120,8 +96,8 @@ class Gltf:
         size = natural(view.value("byteLength"), view.place, "byteLength", buffer.size - start)
         return Buffer(buffer.path, size, buffer.start + start, buffer.held), view
 
-    def accessor(self, owner: Entry, field: str, kind: str, types: tuple[int, ...] = (FLOAT,)) -> Accessor:
-        """The table that a field names, of this type, dense, with one of these component types."""
+    def accessor(self, owner: Entry, field: str, kind: str, types: tuple[int, ...] = (FLOAT,)) -> Table:
+        """The table of numbers that a field names, of this type, dense, with one of these component types."""
         entry = self.item("accessors", owner, field)
         component, normalized = entry.fields.get("componentType"), entry.fields.get("normalized", False)
         right = entry.fields.get("type") == kind and component in types and "sparse" not in entry
@@ -136,20 +112,27 @@ class Gltf:
         count = natural(entry.value("count"), entry.place, "count", buffer.size)
         inside = count > 0 and stride >= item and start + (count - 1) * stride + item <= buffer.size
         entry.place.expect(inside, field, f"values inside its {buffer.size:,} bytes", entry.fields)
-        most = np.iinfo(dtype).max if normalized and component != FLOAT else None
-        return Accessor(entry.place, buffer, start, stride, dtype, width, count, most)
+
+        def read(first: int, stop: int) -> np.ndarray:
+            if first >= stop:
+                return np.zeros((0, width), np.float32)
+            data = buffer.read(start + first * stride, (stop - first - 1) * stride + item)
+            table = np.ndarray((stop - first, width), dtype, data, 0, (stride, dtype.itemsize)).astype(np.float32)
+            return np.maximum(table / np.iinfo(dtype).max, -1) if normalized and component != FLOAT else table
+
+        return count, read
 
     def numbers(self, owner: Entry, field: str, kind: str) -> Float[Tensor, "n c"]:
         """The finite numbers of the accessor that a field names, all in float64; rotations may be integers.
 
         Accessors may share their bytes, so that what is read from a document has a limit in all.
         """
-        found = self.accessor(owner, field, kind, tuple(TYPES) if kind == "VEC4" else (FLOAT,))
-        most = whole_limit("JSON") // 4
-        self._numbers += found.count * found.width
-        found.place.expect(self._numbers <= most, "count", f"at most {most:,} numbers in all", found.count)
-        values = found.read(0, found.count)
-        found.place.expect(bool(np.isfinite(values).all()), "it", "finite", "NaN or infinity")
+        count, read = self.accessor(owner, field, kind, tuple(TYPES) if kind == "VEC4" else (FLOAT,))
+        most, place = whole_limit("JSON") // 4, self.item("accessors", owner, field).place
+        self._numbers += count * WIDTHS[kind]
+        place.expect(self._numbers <= most, "count", f"at most {most:,} numbers in all", count)
+        values = read(0, count)
+        place.expect(bool(np.isfinite(values).all()), "it", "finite", "NaN or infinity")
         return torch.from_numpy(values.astype(np.float64))
 
     @cached_property

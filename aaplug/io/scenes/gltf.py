@@ -26,7 +26,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing, write_file
-from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
+from aaplug.io.gltf import FLOAT, MAGIC, Gltf, Table, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, logit_of, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
@@ -168,15 +168,15 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Te
         tables = {key: document.accessor(attributes, PREFIX + key, *kind) for key, kind in kinds.items()}
         tables["POSITION"] = document.accessor(attributes, "POSITION", "VEC3", tuple({*SIGNED, *UNSIGNED}))
         tables |= {name: document.accessor(attributes, name, "VEC3") for name in harmonics(degree)}
-        counts = {table.count for table in tables.values()}
+        counts = {count for count, _ in tables.values()}
         place.expect(len(counts) == 1, "attributes", "as many rows each", sorted(counts))
         count, load = counts.pop(), partial(_read, tables, degree)
     return Primitive(count, degree, lambda start, stop: standing(load(start, stop), motion, place), extras, note)
 
 
-def _read(tables: dict[str, Accessor], degree: int, start: int, stop: int) -> Gaussians:
+def _read(tables: dict[str, Table], degree: int, start: int, stop: int) -> Gaussians:
     def column(name: str) -> Tensor:
-        return torch.from_numpy(tables[name].read(start, stop))
+        return torch.from_numpy(tables[name][1](start, stop))
 
     sh = torch.stack([column(name) for name in harmonics(degree)], dim=1)
     quats, opacities = column("ROTATION").roll(1, dims=1), logit_of(column("OPACITY")[:, 0])
