@@ -7,10 +7,10 @@ Keys at the top hold for every scene; a [[scene]] table names one scene and may 
 import os
 import tomllib
 from collections.abc import Mapping
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from aaplug.io.atomic import AnyPath
 from aaplug.io.values import read_bounded
 from aaplug.system.errors import FormatError
 
@@ -18,7 +18,7 @@ MAX_SIZE = 2**20  # bytes: thousands of scenes
 PATH_KEYS = ("scene", "model_path", "cameras", "output", "lpips")
 
 
-def read_batch(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+def read_batch(path: AnyPath) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """The settings of all scenes, and each scene's own by its name, or else that of its file or folder.
 
     Keys have underscores.

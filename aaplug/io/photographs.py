@@ -6,7 +6,6 @@ The choice of downscaling moves PSNR by 0.5 dB and more, so each method of the f
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -65,9 +64,7 @@ class Downscale:
     check: Callable[[float], object] | None = None
 
 
-def read_photo(
-    path: str | PathLike[str], background: Background, undistortion: Undistortion | None = None
-) -> Float[Tensor, "h w 3"]:
+def read_photo(path: Path, background: Background, undistortion: Undistortion | None = None) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
     return quantised(undistorted(read_image(path, background), undistortion))
 

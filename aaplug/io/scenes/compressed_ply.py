@@ -89,30 +89,27 @@ def _need(path: Path, element: Element, columns: Sequence[str], code: str) -> No
 
 
 def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int) -> Gaussians:
+    def between(names: list[str], share: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        ends = torch.from_numpy(np.stack([bounds[c][of_row] for c in names], axis=1))
+        return torch.lerp(ends[:, :3], ends[:, 3:], share)
+
     words = tables["vertex"].read(start, stop)
     rest = tables["sh"].read(start, stop) if degree else None
     of_row = np.arange(start, stop) // CHUNK_LENGTH
     colour = words["packed_color"]
     rgb = fractions(colour, (24, 8), (16, 8), (8, 8))
     if COLOUR_BOUNDS[0] in (bounds.dtype.names or ()):
-        rgb = _between(bounds, COLOUR_BOUNDS, of_row, rgb)
+        rgb = between(COLOUR_BOUNDS, rgb)
     sh = torch.zeros(len(words), (degree + 1) ** 2, 3)
     sh[:, 0] = sh_of_colour(rgb)
     if rest is not None:
         k = sh.shape[1] - 1
         for i in range(3 * k):
             sh[:, 1 + i % k, i // k] = torch.from_numpy(HARMONICS[rest[f"f_rest_{i}"]])
-    means = _between(bounds, BOUNDS, of_row, fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
-    scales = _between(bounds, SCALE_BOUNDS, of_row, fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
+    means = between(BOUNDS, fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
+    scales = between(SCALE_BOUNDS, fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
     quats = word_quats(words["packed_rotation"], *COMPONENTS)
     return Gaussians(means, quats, scales, byte_opacities(colour & 255), sh)
-
-
-def _between(
-    bounds: np.ndarray, names: list[str], of_row: np.ndarray, share: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    ends = torch.from_numpy(np.stack([bounds[c][of_row] for c in names], axis=1))
-    return torch.lerp(ends[:, :3], ends[:, 3:], share)
 
 
 # Writing

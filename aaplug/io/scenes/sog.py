@@ -71,15 +71,16 @@ Fetch = Callable[[str, int], bytes]
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An entry of meta.json, with its images as RGBA, a row per pixel, and the width of the first."""
+    """An entry of meta.json of a version, with its images as RGBA, a row per pixel, and the width of the first."""
 
+    version: int
     entry: Entry
     pixels: list[np.ndarray]
     width: int
 
-    def values(self, pixels: np.ndarray, version: int) -> Float[Tensor, "*n c"]:
+    def values(self, pixels: np.ndarray) -> Float[Tensor, "*n c"]:
         """Bytes as indices into the codebook, or in version 1 as fractions from mins to maxs."""
-        if version > 1:
+        if self.version > 1:
             return self.entry.vector("codebook", 256).float()[torch.from_numpy(pixels.astype(np.int64))]
         low, high = (self.entry.vector(key, pixels.shape[1]).float() for key in ("mins", "maxs"))
         return torch.lerp(low, high, floats(pixels) / 255)
@@ -105,11 +106,11 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         count = natural(value, root.place, "count", MAX_COUNT)
         check_count(path, count)
         used = ["means", "quats", "scales", "sh0", *["shN"] * bool(meta.get("shN"))]
-        parts = {key: _part(path, root, key, count, fetch) for key in used}
-        palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
+        parts = {key: _part(path, version, root.entry(key), count, fetch) for key in used}
+        palette = _palette(parts["shN"]) if "shN" in parts else torch.zeros(1, 0, 3)
         facts = read_record(path, meta, _meaning(meta))
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
-    load, notes = partial(_rows, parts, palette, version, facts.flat), (f"version {version}",)
+    load, notes = partial(_rows, parts, palette, facts.flat), (f"version {version}",)
     files = [file for part in parts.values() for file in part.entry.value("files")] if _is_meta(path) else []
     others = tuple(path.parent / file for file in files)
     return Scene(path, name, count, degree, load, *facts, notes=notes, others=others)
@@ -140,9 +141,8 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
         return stream.read(most + 1)
 
 
-def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
-    entry = root.entry(key)
-    files = entry.value("files")
+def _part(path: Path, version: int, entry: Entry, count: int, fetch: Fetch) -> Part:
+    key, files = entry.place.entry, entry.value("files")
     wanted = 2 if key in ("means", "shN") else 1
     entry.place.expect(isinstance(files, list) and len(files) == wanted, "files", f"{wanted} names", files)
     images = list[np.ndarray]()
@@ -161,7 +161,7 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
                 wanted = most if palette else count
                 raise FormatError(path, f"{file} has {width}x{height} px, and {wanted:,} are wanted")
             images.append(np.asarray(image.convert("RGBA")))
-    return Part(entry, [image.reshape(-1, BYTES_PER_PIXEL) for image in images], images[0].shape[1])
+    return Part(version, entry, [image.reshape(-1, BYTES_PER_PIXEL) for image in images], images[0].shape[1])
 
 
 def _meaning(meta: dict[str, Any]) -> Facts:
@@ -176,26 +176,24 @@ def _meaning(meta: dict[str, Any]) -> Facts:
     return Facts(said + ("" if model == "default" else " is unknown: assumed classic"))
 
 
-def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
+def _palette(part: Part) -> Float[Tensor, "p c 3"]:
     """The harmonics that labels index."""
     coefficients, rest = divmod(part.width, PALETTE_ROW)
     if coefficients not in (3, 8, 15) or rest:
         raise part.entry.place.error(f"the palette's image is {part.width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
-    if version > 1:
-        return part.values(pixels, version)
+    if part.version > 1:
+        return part.values(pixels)
     low, high = (part.entry.get(key, number) for key in ("mins", "maxs"))
     return floats(pixels) / 255 * (high - low) + low
 
 
-def _rows(
-    parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, start: int, stop: int
-) -> Gaussians:
+def _rows(parts: dict[str, Part], palette: Float[Tensor, "p c 3"], flat: bool, start: int, stop: int) -> Gaussians:
     rows = slice(start, stop)
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
-    log_scales = scales.values(scales.pixels[0][rows, :3], version)
-    colours = sh0.values(sh0.pixels[0][rows, : 3 if version > 1 else 4], version)
-    logits = byte_opacities(sh0.pixels[0][rows, 3]) if version > 1 else colours[:, 3]
+    log_scales = scales.values(scales.pixels[0][rows, :3])
+    colours = sh0.values(sh0.pixels[0][rows, : 3 if sh0.version > 1 else 4])
+    logits = byte_opacities(sh0.pixels[0][rows, 3]) if sh0.version > 1 else colours[:, 3]
     sh = torch.zeros(len(logits), 1 + palette.shape[1], 3)
     sh[:, 0] = colours[:, :3]
     if "shN" in parts:
