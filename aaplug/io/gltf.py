@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -138,20 +139,17 @@ class Gltf:
     @cached_property
     def parents(self) -> dict[int, int | None]:
         """The node above each node, None above a root; every node stands after the one above it."""
-        nodes, below = self.items("nodes"), dict[int | None, list[int]]()
+        nodes = self.items("nodes")
         parents: dict[int, int | None] = dict.fromkeys(range(len(nodes)))
         for above, node in enumerate(nodes):
             children = node.fields.get("children", [])
             node.place.expect(isinstance(children, list), "children", "a list of nodes", children)
             parents |= {natural(child, node.place, "children", len(nodes) - 1): above for child in children}
-        for node, above in parents.items():
-            below.setdefault(above, []).append(node)
-        order = list(below.get(None, []))
-        for node in order:  # it grows meanwhile
-            order += below.get(node, [])
-        if len(order) < len(nodes):
-            raise FormatError(self.path, "its nodes lie in a circle")
-        return {node: parents[node] for node in order}
+        graph = {node: () if parent is None else (parent,) for node, parent in parents.items()}
+        try:
+            return {node: parents[node] for node in TopologicalSorter(graph).static_order()}
+        except CycleError as error:
+            raise FormatError(self.path, "its nodes lie in a circle") from error
 
     def _buffer(self, buffer: Entry) -> Buffer:
         if "uri" not in buffer:

@@ -82,21 +82,9 @@ class WritableFormat(SceneFormat, Protocol):
         ...
 
 
+MODULES: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat, lcc)
 # the first that accepts a file is used
-OWN: tuple[SceneFormat, ...] = (
-    compressed_ply,
-    ply,
-    spz,
-    sog,
-    pt,
-    splat,
-    ksplat,
-    *gltf.FORMATS,
-    sog.UNBUNDLED,
-    *usd.FORMATS,
-    lcc,
-    *chunked.FORMATS,
-)
+OWN: tuple[SceneFormat, ...] = (*MODULES, *gltf.FORMATS, sog.UNBUNDLED, *usd.FORMATS, *chunked.FORMATS)
 SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
 SceneLike = Scene | Gaussians | Pyramid | AnyPath
 

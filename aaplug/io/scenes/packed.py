@@ -1,4 +1,4 @@
-"""Parts of formats other than .ply: values as they store them, bounded decompression, axes, and files of several files.
+"""Parts of formats other than .ply: values as they store them, axes, and files of several files.
 
 n: rows.  Arrays are numpy's, as they come from files.
 
@@ -22,24 +22,14 @@ from aaplug.core.gaussians import MIN_OPACITY, Gaussians, joined
 from aaplug.core.placing import mirrored, placed
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import check_output, write_file
-from aaplug.io.limits import limit
 from aaplug.io.values import Place
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError
 
 MAX_BYTE = 255
 HASH_DIGITS = 8  # in the name of a file that another one names
 UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
 Piece = tuple[int, Callable[[int, int], Gaussians]]  # of a scene: how many rows, what reads those from start up to stop
 half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
-
-
-def check_growth(path: Path, inflated: int, compressed: int) -> None:
-    """Refuse compressed bytes that announce a larger size than a real scene would have."""
-    if inflated > limit("INFLATE") * compressed + limit("SLACK"):
-        many = f"announce {inflated:,}, more than {limit('INFLATE'):g} times as many"
-        bomb = "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)"
-        raise FormatError(path, f"its {compressed:,} compressed bytes {many}; {bomb}")
 
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:

@@ -1,4 +1,4 @@
-"""Parts of every scene format: its options, errors of libraries as ours, rows of a table, the limit of a scene."""
+"""Parts of every scene format: its options, errors of libraries as ours, rows of a table, limits."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aaplug.core.conventions import SpzAxes, SpzVersion
-from aaplug.io.limits import whole_limit
+from aaplug.io.limits import limit, whole_limit
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.errors import AaplugError, FormatError, reason
 
@@ -70,3 +70,11 @@ def check_count(path: Path, count: int) -> None:
     most = whole_limit("GAUSSIANS")
     if count > most:
         raise FormatError(path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it")
+
+
+def check_growth(path: Path, inflated: int, compressed: int) -> None:
+    """Refuse compressed bytes that announce a larger size than a real scene would have."""
+    if inflated > limit("INFLATE") * compressed + limit("SLACK"):
+        many = f"announce {inflated:,}, more than {limit('INFLATE'):g} times as many"
+        bomb = "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)"
+        raise FormatError(path, f"its {compressed:,} compressed bytes {many}; {bomb}")

@@ -32,18 +32,9 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.codebooks import codebook, nearest_value, palette
-from aaplug.io.scenes.packed import (
-    MAX_BYTE,
-    byte_opacities,
-    bytes_of,
-    check_growth,
-    floats,
-    largest_last,
-    replacing_group,
-    without_largest,
-)
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_last, replacing_group, without_largest
 from aaplug.io.scenes.record import KEY, Facts, along_curve, read_record, record_of, warn_of_moves, whole
-from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, check_growth, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, natural, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
@@ -297,7 +288,7 @@ def _webp(table: np.ndarray, width: int) -> bytes:
     """A lossless image of rows of at most four bytes, opaque if they have no fourth; colours under alpha 0 stay."""
     height = -(-len(table) // width)
     pixels = np.zeros((height * width, 4), np.uint8)
-    pixels[:, 3] = MAX_BYTE
+    pixels[:, 3] = 255
     pixels[: len(table), : table.shape[1]] = table
     image, stream = Image.fromarray(pixels.reshape(height, width, 4)), io.BytesIO()
     image.save(stream, "WEBP", lossless=True, exact=True, quality=WEBP_EFFORT, method=WEBP_METHOD)

@@ -32,9 +32,9 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored
 from aaplug.io.atomic import write_file
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.packed import byte_opacities, bytes_of, check_growth, floats, largest_last, without_largest
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_last, without_largest
 from aaplug.io.scenes.record import holdable, warn_of_moves, warn_of_sizes
-from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
+from aaplug.io.scenes.rows import SceneFileOptions, check_count, check_growth, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
 
