@@ -364,7 +364,7 @@ def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):
 
 @pytest.mark.parametrize("axes", [*AXES[1:], "9"])
 def test_axes_that_a_spz_states_are_turned_into_ours(tmp_path: Path, expected, axes: str):
-    data = bytearray(packed(Path("a"), [expected], 4, "RDF"))
+    data = bytearray(packed(Path("a"), expected, 4, "RDF"))
     struct.pack_into("<I", data, 40, 9 if axes == "9" else AXES.index(axes))
     (tmp_path / "a.spz").write_bytes(data)
     if axes == "9":

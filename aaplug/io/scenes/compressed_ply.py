@@ -124,8 +124,8 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     bounds, shares = zip(*(_bounded(values, chunk) for values in (scene.means, log_scales, colours)), strict=True)
     steps = torch.tensor([(1 << bits) - 1 for _, bits in ELEVEN_TEN_ELEVEN])
     span = (bounds[0][:, 3:] - bounds[0][:, :3])[chunk]
-    warn_of_moves(path, name, [(scene, ((shares[0] * steps).round() / steps - shares[0]) * span)])
-    warn_of_sizes(path, name, [scene], -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
+    warn_of_moves(path, name, scene, ((shares[0] * steps).round() / steps - shares[0]) * span)
+    warn_of_sizes(path, name, scene, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     rest, largest = without_largest(scene.unit_quats)
     turns = _word(rest / 2**0.5 + 0.5, *COMPONENTS) | largest << 30
     rgba = torch.cat([shares[2], scene.opacities[:, None]], dim=1)

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.atomic import replacing, write_file
 from aaplug.io.gltf import FLOAT, MAGIC, Gltf, Table, at_rest, glb_start
 from aaplug.io.scenes import spz
@@ -91,12 +91,11 @@ class GltfFormat:
         if self.name == "glb":
             _write_glb(path, held, count, overwrite)
             return
-        scenes, buffer = list(held), io.BytesIO()
-        document = _Document(path, scenes[0], sum(map(len, scenes)))
-        for part in scenes:
-            document.add(part, buffer if self.name == "gltf" else None)
+        scene, buffer = joined([*held]), io.BytesIO()
+        document = _Document(path, scene, len(scene))
+        document.add(scene, buffer if self.name == "gltf" else None)
         if self.name == "spz.glb":
-            blob = spz.packed(path, scenes, 2, "RUB")
+            blob = spz.packed(path, scene, 2, "RUB")
             blob += bytes(-len(blob) % 4)
             write_file(path, glb_start(document.json(blob=len(blob)), len(blob)) + blob, overwrite)
         else:

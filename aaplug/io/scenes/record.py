@@ -6,11 +6,10 @@ format's own tag or in the record, and a warning names what reading the file aga
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -84,21 +83,20 @@ def along_curve(scene: Gaussians) -> Gaussians:
     return scene[curve(squeezed(scene.means.double())).argsort(stable=True)]
 
 
-def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Float[Tensor, "_ 3"]]]) -> None:
+def warn_of_moves(path: Path, format: str, scene: Gaussians, moves: Float[Tensor, "n 3"]) -> None:
     """Warn where a format's steps move centres by more than their Gaussians' size, as some far away make them do.
 
-    moves: of each part of the scene the part, and how far rounding moves each centre, in world units.
+    moves: how far rounding moves each centre, in world units.
     """
-    count = sum(len(part) for part, _ in moves)
-    far = sum(int((by.norm(dim=1) > part.scales.amax(dim=1)).sum()) for part, by in moves)
-    if far > MOVED_SHARE * count:
-        what = f"move {far:,} of {counted(count, 'Gaussian')} by more than their size"
+    far = int((moves.norm(dim=1) > scene.scales.amax(dim=1)).sum())
+    if far > MOVED_SHARE * len(scene):
+        what = f"move {far:,} of {counted(len(scene), 'Gaussian')} by more than their size"
         log.warning("%s: the steps of a .%s, as wide as the scene, %s; a .ply has none", path, format, what)
 
 
-def warn_of_sizes(path: Path, format: str, parts: Sequence[Gaussians], least: float, most: float) -> None:
+def warn_of_sizes(path: Path, format: str, scene: Gaussians, least: float, most: float) -> None:
     """Warn where Gaussians are smaller or larger than a format holds; least, most: of its log-scales."""
-    sizes, ends = torch.cat([part.log_scales.amax(dim=1) for part in parts]), (math.exp(least), math.exp(most))
+    sizes, ends = scene.log_scales.amax(dim=1), (math.exp(least), math.exp(most))
     odd = int(((sizes < least) | (sizes > most)).sum())
     if odd > MOVED_SHARE * len(sizes):
         what = f"{odd:,} of {counted(len(sizes), 'Gaussian')} of another size than {ends[0]:.3g} to {ends[1]:.3g} units"

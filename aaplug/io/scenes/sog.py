@@ -239,7 +239,7 @@ def encoded(path: Path, parts: Iterable[Gaussians]) -> tuple[dict[str, Any], dic
     least, most = logs.amin(dim=0), logs.amax(dim=0)
     span = torch.where(most > least, most - least, 1.0)
     steps = ((logs - least) / span * 65535).round().long()
-    warn_of_moves(path, name, [(scene, _unsquashed(least + span * steps / 65535) - scene.means)])
+    warn_of_moves(path, name, scene, _unsquashed(least + span * steps / 65535) - scene.means)
     rest, largest = without_largest(scene.unit_quats)
     log_scales = scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     scale_levels, colour_levels = codebook(log_scales.flatten(), LEVELS), codebook(scene.sh[:, 0].flatten(), LEVELS)

@@ -15,7 +15,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, pairwise
@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import mirrored
 from aaplug.io.atomic import write_file
 from aaplug.io.limits import whole_limit
@@ -237,33 +237,29 @@ def _turned(scene: Gaussians, axes: str) -> Gaussians:
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene, with values rounded to the format's steps."""
     axes, _ = NAMED_AXES["opengl" if options.spz_axes == "auto" else options.spz_axes]
-    scenes = [_turned(part, axes) for part in parts]
-    content = packed(path, scenes, options.spz_version, axes)
-    write_file(path, content, overwrite)
+    write_file(path, packed(path, _turned(joined([*parts]), axes), options.spz_version, axes), overwrite)
 
 
-def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> bytes:
-    """The content of a .spz of version 2, 3 or 4, which alone states these axes, the scenes' own.
+def packed(path: Path, scene: Gaussians, version: int, axes: str) -> bytes:
+    """The content of a .spz of version 2, 3 or 4, which alone states these axes, the scene's own.
 
     Raises OutputError for a scene that it cannot hold.
     """
-    old, count, first = version < STREAMS_VERSION, sum(map(len, scenes)), scenes[0]
-    for part in scenes:
-        holdable(path, part, name, MAX_OLD_DEGREE if old else MAX_DEGREE)
+    old, count = version < STREAMS_VERSION, len(scene)
+    holdable(path, scene, name, MAX_OLD_DEGREE if old else MAX_DEGREE)
     if old and count > MAX_OLD_GAUSSIANS:
         raise OutputError(path, f"readers take {MAX_OLD_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
-    farthest = max(float(part.means.abs().max()) if len(part) else 0.0 for part in scenes)
+    farthest = float(scene.means.abs().max()) if count else 0.0
     fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
     if farthest >= REACH:
         where = f"positions as far as {farthest:g} from the origin"
         raise OutputError(path, f"cannot hold {where}; move the scene by aaplug merge, or write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
-    moves = [(part.means * 2**fraction).round() / 2**fraction - part.means for part in scenes]
-    warn_of_moves(path, name, [*zip(scenes, moves, strict=True)])
-    warn_of_sizes(path, name, scenes, MIN_LOG_SCALE, MIN_LOG_SCALE + 255 / SCALE_STEPS)
-    sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
-    flags = ANTIALIASED_FLAG * first.convention.compensated
-    facts = version, count, first.sh_degree, fraction
+    warn_of_moves(path, name, scene, (scene.means * 2**fraction).round() / 2**fraction - scene.means)
+    warn_of_sizes(path, name, scene, MIN_LOG_SCALE, MIN_LOG_SCALE + 255 / SCALE_STEPS)
+    sections = _columns(scene, version, fraction)
+    flags = ANTIALIASED_FLAG * scene.convention.compensated
+    facts = version, count, scene.sh_degree, fraction
     if old:
         return gzip.compress(HEADER.pack(MAGIC, *facts, flags, 0) + b"".join(sections), mtime=0)
     record = RECORD.pack(COORDINATES, 4) + AXES.index(axes).to_bytes(4, "little")
