@@ -88,8 +88,7 @@ def told_by_library() -> Iterator[None]:
 def claimed(path: AnyPath) -> Iterator[None]:
     """Keep other processes from writing an output, a file or a folder, while the block runs.
 
-    Raises:
-        OutputError: another process is writing it, or nothing can be written beside it.
+    Raises OutputError if another process is writing it, or nothing can be written beside it.
     """
     path = Path(os.path.realpath(path))
     name = OUR_PREFIX + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:HASH_DIGITS]

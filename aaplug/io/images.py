@@ -145,10 +145,7 @@ def encoded(suffix: str, image: Float[Tensor, "h w c"], quality: int | None = No
 
 
 def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
-    """Width and height in px, whether it is transparent, and a TIFF's kind of alpha, of a file within the limits.
-
-    The file declares them before its pixels.
-    """
+    """Width and height in px, whether it is transparent, and a TIFF's kind of alpha, by the header; checks limits."""
     pillow_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it is lower than ours and only warns
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
@@ -254,11 +251,7 @@ def captured_stderr() -> Iterator[IO[bytes]]:
 
 
 def colour_of(text: str, where: str = "background") -> Colour:
-    """The opaque colour that CSS writes so, by name, as #rrggbb, rgb(...) or hsl(...).
-
-    Raises:
-        UsageError: CSS knows no such colour; the error is at `where`.
-    """
+    """The opaque colour that CSS writes so, by name, #rrggbb, rgb(...) or hsl(...); raises UsageError at `where`."""
     # Pillow knows CSS's commas, not its spaces
     listed = text if "," in text else re.sub(r"(?<=[\d%])\s+(?=\d)", ",", text)
     try:

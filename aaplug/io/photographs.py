@@ -16,6 +16,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import WHOLE_SLACK, Camera, Undistortion
 from aaplug.core.imaging import Factors, box_average, levels, quantised, resampled
+from aaplug.io.atomic import AnyPath
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
 from aaplug.system.errors import FormatError, UsageError
@@ -64,7 +65,9 @@ class Downscale:
     check: Callable[[float], object] | None = None
 
 
-def read_photo(path: Path, background: Background, undistortion: Undistortion | None = None) -> Float[Tensor, "h w 3"]:
+def read_photo(
+    path: AnyPath, background: Background, undistortion: Undistortion | None = None
+) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
     return quantised(undistorted(read_image(path, background), undistortion))
 

@@ -58,12 +58,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """A header's lines and what they declare.
-
-    path: the file, for messages.
-    coding: LITTLE, BIG or TEXT.
-    size: of the header in its file.
-    """
+    """A header's lines and what they declare.  path: for messages.  coding: LITTLE, BIG or TEXT.  size: in its file."""
 
     path: str
     lines: tuple[str, ...]

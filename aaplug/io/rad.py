@@ -45,8 +45,7 @@ BANDS = (slice(1, 4), slice(4, 9), slice(9, 16))  # coefficients of degrees 1 to
 class Tree(NamedTuple):
     """Gaussians from the root down, the children of each side by side.
 
-    counts: of each one's children; 0 at a leaf.
-    starts: place of the first child.
+    counts: of each one's children; 0 at a leaf.  starts: place of the first child.
     """
 
     scene: Gaussians

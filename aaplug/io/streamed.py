@@ -74,9 +74,7 @@ log = logging.getLogger("aaplug")
 class Stream:
     """The files of a stream, and the viewer that reads them.
 
-    viewer: for whose rule levels are tuned.
-    index: name of the index.
-    content: name of a part's file.
+    viewer: for whose rule levels are tuned.  index: name of the index.  content: name of a part's file.
     programs: what the page needs, as files or folders of node_modules.
     extent: standard deviations to which a part's box holds its Gaussians.
     """
@@ -240,8 +238,7 @@ def write_index(
     """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
     rate: of training, in px per world unit.  frame: what a page shows first.
-    compensated: levels are for a rule with compensation.
-    tree: of a .rad.
+    compensated: levels are for a rule with compensation.  tree: of a .rad.
     middle: what the parts are relative to; see `middle_of`.
     """
     stream = STREAMS[name]

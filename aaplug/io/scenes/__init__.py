@@ -90,10 +90,7 @@ SceneLike = Scene | Gaussians | Pyramid | AnyPath
 
 
 def scene_of(scene: SceneLike, still: bool = False) -> Scene:
-    """The scene itself, that of Gaussians in memory, or that of a path as `read_scene` opens it.
-
-    still: raise a UsageError for a scene in time.
-    """
+    """The scene itself, or that of Gaussians or a path; still: raise a UsageError for a scene in time."""
     if isinstance(scene, Gaussians | Pyramid):
         return Scene.in_memory(scene)
     opened = scene if isinstance(scene, Scene) else read_scene(scene)
@@ -257,10 +254,7 @@ def _ending(format: SceneFormat) -> str:
 
 
 def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> WritableFormat:
-    """The format that will write `path`; refuses an output that cannot be written, before any work.
-
-    Errors: see `write_scene`.
-    """
+    """The format that will write `path`; refuses one that cannot be written, before any work, as `write_scene`."""
     writer = written_format(path)
     if writer is None:
         known = [_ending(format) for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]

@@ -93,11 +93,8 @@ def replacing_group(
     The others' names carry a hash of their content, so that a file that is replaced never names a new one of them.
     Those of an earlier version are removed at the end, where no other file of the same suffix names them.
 
-    Args:
-        path: of the file that names the others.
-        beside: contents by plain name.
-        whole: makes its content of their names in the folder, by plain name.
-        overwrite: replace an existing file.
+    path: of the file that names the others.  beside: their contents by plain name.
+    whole: makes its content of their names in the folder, by plain name.
     """
     check_output(path, overwrite)
     names, earlier = dict[str, str](), set[Path]()

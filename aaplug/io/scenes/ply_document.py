@@ -24,10 +24,7 @@ from aaplug.system.errors import FormatError
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The Gaussians' rows in a file, or in memory if they had to be parsed.
-
-    stamp: the file's size and time of change when it was opened.
-    """
+    """The Gaussians' rows in a file, or in memory if they had to be parsed.  stamp: of the file when it was opened."""
 
     path: Path
     offset: int

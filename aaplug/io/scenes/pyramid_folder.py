@@ -57,8 +57,7 @@ def is_pyramid(folder: AnyPath) -> bool:
 def read_manifest(folder: AnyPath, unfinished: bool = False) -> Manifest:
     """Read lod.json; one that lists fewer levels than were asked for is refused unless `unfinished` allows it.
 
-    Raises:
-        FormatError: it is unfinished, breaks its format or is of another version.
+    Raises FormatError if it is unfinished, breaks its format or is of another version.
     """
     path = Path(folder) / MANIFEST
     about = object_of(read_json(path), path, "the pyramid", f"'{KEY}'", KEY)
@@ -82,11 +81,7 @@ def read_manifest(folder: AnyPath, unfinished: bool = False) -> Manifest:
 
 
 def read_pyramid(folder: AnyPath) -> Pyramid:
-    """Read a folder that `aaplug.lod` wrote.
-
-    Raises:
-        FormatError: lod.json or a level is missing, broken, or not what it should be.
-    """
+    """Read a folder of `aaplug.lod`; raises FormatError if lod.json or a level is missing, broken or another."""
     levels = list(levels_in(folder, read_manifest(folder)))
     return Pyramid.of([level.scene for level in levels], [c for level in levels if (c := level.chunks) is not None])
 
@@ -116,11 +111,7 @@ def write_manifest(folder: AnyPath, manifest: Manifest) -> None:
 
 
 def path_of(folder: Path, level: LevelFile) -> Path:
-    """The file of a level.
-
-    Raises:
-        FormatError: it is missing or not the one that lod.json names.
-    """
+    """The file of a level; raises FormatError if it is missing or not the one that lod.json names."""
     path = folder / level.file
     if not path.is_file():
         raise FormatError(path, f"is missing: {MANIFEST} names it as a level; `aaplug lod --overwrite` makes it again")

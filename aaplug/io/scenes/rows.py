@@ -20,8 +20,7 @@ MAX_REASON = 200  # characters of a library's message
 class SceneFileOptions:
     """The user's choices, see `read_scene` and `write_scene`, of which each format uses those that concern it.
 
-    Raises:
-        UsageError: there are no such axes, or no such version.
+    Raises UsageError if there are no such axes, or no such version.
     """
 
     allow_checkpoint: bool = False

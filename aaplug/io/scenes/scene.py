@@ -98,11 +98,7 @@ class Scene:
     @classmethod
     @contract
     def in_memory(cls, held: Gaussians | Pyramid) -> "Scene":
-        """The scene of Gaussians, or of all levels of detail.
-
-        Raises:
-            UsageError: some have NaN, infinite or unusable values.
-        """
+        """The scene of Gaussians, or of all levels; raises UsageError for NaN, infinite and unusable values."""
         check_values(held.scene if isinstance(held, Pyramid) else held)
         finest, levels = (held.finest, held) if isinstance(held, Pyramid) else (held, None)
         facts = finest.convention, finest.fused, finest.flat
