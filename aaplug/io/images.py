@@ -16,7 +16,7 @@ import struct
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageColor
 from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import levels
@@ -73,25 +74,12 @@ def is_transparent(path: Path) -> bool:
 @contract
 def read_image(path: AnyPath, background: tuple[float, float, float] | None = None) -> Float[Tensor, "h w 3"]:
     """Read an 8- or 16-bit image; a transparent one is composited over `background` in float, and refused if None."""
-
-    def composited(rows: Tensor) -> Tensor:
-        if rows.shape[2] < ALPHA_CHANNELS:
-            return rows
-        if background is None:
-            raise FormatError(path, "is transparent; pass `background`, the colour behind it")
-        rgb, alpha = rows[..., :3], rows[..., 3:]
-        return rgb * alpha + torch.tensor(background, dtype=torch.float32) * (1 - alpha)
-
-    return _read(Path(path), 3, composited)
+    return _read(Path(path), 3, background)
 
 
 def read_rgba(path: AnyPath) -> Float[Tensor, "h w 4"]:
     """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none."""
-
-    def with_alpha(rows: Tensor) -> Tensor:
-        return rows if rows.shape[2] == ALPHA_CHANNELS else torch.nn.functional.pad(rows, (0, 1), value=1.0)
-
-    return _read(Path(path), ALPHA_CHANNELS, with_alpha)
+    return _read(Path(path), ALPHA_CHANNELS, None)
 
 
 @contract
@@ -174,8 +162,8 @@ def _look(path: Path) -> tuple[tuple[int, int], bool, int]:
 
 
 @torch_threads(1)
-def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
-    """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
+def _read(path: Path, channels: int, background: tuple[float, float, float] | None) -> Float[Tensor, "h w c"]:
+    """Values in [0, 1], RGBA or RGB over a background, in bands of rows: memory holds the samples and the result."""
     size, transparent, alpha = _look(path)
     try:
         data = _still(path, path.read_bytes())
@@ -200,10 +188,16 @@ def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Fl
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
     samples = samples.reshape(height, width, -1)
     order = [0, 0, 0] if samples.shape[2] == 1 else [2, 1, 0, 3][: samples.shape[2]]  # from BGR(A) or gray
+    composited = len(order) > channels
+    if composited and background is None:
+        raise FormatError(path, "is transparent; pass `background`, the colour behind it")
     highest, image = np.iinfo(str(samples.dtype)).max, torch.empty(height, width, channels)
     for start in range(0, height, ROWS_PER_BAND):
-        rows = samples[start : start + ROWS_PER_BAND, :, order].astype(np.float32) / highest
-        image[start : start + ROWS_PER_BAND] = finished(torch.from_numpy(rows))
+        rows = torch.from_numpy(samples[start : start + ROWS_PER_BAND, :, order].astype(np.float32) / highest)
+        if composited:
+            rgb, alpha = rows[..., :3], rows[..., 3:]
+            rows = rgb * alpha + torch.tensor(background, dtype=torch.float32) * (1 - alpha)
+        image[start : start + ROWS_PER_BAND] = functional.pad(rows, (0, channels - rows.shape[2]), value=1.0)
     return image
 
 

@@ -32,7 +32,7 @@ from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, logit_of, repla
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.io.values import Entry
+from aaplug.io.values import Entry, entries
 from aaplug.system.errors import FormatError, OutputError
 
 SPLATS, SPZ = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
@@ -135,11 +135,8 @@ def _primitives(document: Gltf) -> list[Primitive]:
     if not holders:
         places = [(mesh, torch.eye(4, dtype=torch.float64)) for mesh in document.items("meshes")]
     for mesh, motion in places:
-        listed = mesh.value("primitives")
-        mesh.place.expect(isinstance(listed, list), "primitives", "a list", listed)
-        for fields in listed:
-            mesh.place.expect(isinstance(fields, dict), "primitives", "a list of objects", fields)
-            primitive = Entry(mesh.place, fields)
+        for each in entries(document.path, "primitive", mesh.value("primitives")):
+            primitive = Entry(mesh.place, each.fields)
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
             if SPLATS in extensions:
                 found.append(_primitive(document, primitive, extensions.entry(SPLATS), motion))

@@ -16,7 +16,7 @@ from torch import Tensor
 from aaplug.core.chunks import curve, squeezed
 from aaplug.core.conventions import CLASSIC, CONVENTIONS, Convention
 from aaplug.core.gaussians import Fusion, Gaussians, joined
-from aaplug.io.values import Entry, Place, text
+from aaplug.io.values import Entry, Place, entries, text
 from aaplug.system.errors import OutputError, counted
 
 KEY = "aaplug"  # of the record in a JSON document
@@ -47,13 +47,10 @@ def read_record(path: Path, holder: dict[str, Any], otherwise: Facts) -> Facts:
     record = Entry(Place(path, "its object"), holder).entry(KEY)
     name = record.get("convention", text)
     record.place.expect(name in CONVENTIONS, "convention", f"one of {', '.join(CONVENTIONS)}", name)
-    listed, fused = record.fields.get("fused", []), list[Fusion]()
-    record.place.expect(isinstance(listed, list), "fused", "a list", listed)
-    for each in listed:
-        record.place.expect(isinstance(each, dict), "fused", "a list of objects", each)
-        fusion = Entry(record.place, each)
+    fused = list[Fusion]()
+    for fusion in entries(path, "fusion", record.value("fused")) if "fused" in record else ():
         settings = fusion.entry("settings").fields
-        pairs = {text(k, record.place, "a setting"): text(v, record.place, "a setting") for k, v in settings.items()}
+        pairs = {text(k, fusion.place, "a setting"): text(v, fusion.place, "a setting") for k, v in settings.items()}
         fused.append(Fusion(fusion.get("method", text), pairs))
     return Facts(f"aaplug's record in the file: {name}", CONVENTIONS[name], tuple(fused), otherwise.flat)
 

@@ -127,13 +127,12 @@ def parsed(path: Path, data: bytes) -> tuple[Header, list[np.ndarray], str | Non
     head = zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
     if len(head) < HEADER.size or not head.startswith(MAGIC):
         raise FormatError(path, "is not an .spz: its header is missing")
-    _, version, count, degree, fraction, flags, _ = HEADER.unpack(head)
-    if not FIRST_VERSION <= version <= STREAMS_VERSION:
-        raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS_VERSION}")
-    if degree > MAX_DEGREE or fraction > MAX_FRACTION:
-        raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
-    check_count(path, count)
-    header = Header(version, count, degree, fraction, flags)
+    header = Header(*HEADER.unpack(head)[1:6])
+    if not FIRST_VERSION <= header.version <= STREAMS_VERSION:
+        raise FormatError(path, f"is .spz of version {header.version}; known are 1 to {STREAMS_VERSION}")
+    if header.degree > MAX_DEGREE or header.fraction > MAX_FRACTION:
+        raise FormatError(path, f"has the impossible SH degree {header.degree} or {header.fraction} bits of fraction")
+    check_count(path, header.count)
     sizes = [width * header.count for width in header.widths]
     if header.version >= STREAMS_VERSION:
         if zipped:
