@@ -47,10 +47,7 @@ def with_lenses(
 ) -> tuple[list[Camera], list[str]]:
     """The cameras with their lenses, without photographs that cannot be used; and notes on the lenses, if any.
 
-    undistort: as pinholes instead, cropped to what their photographs cover.
-
-    Raises:
-        UsageError: a panorama is to be undistorted.
+    undistort: as pinholes instead, cropped to what their photographs cover; raises UsageError for a panorama.
     """
     drawn, names = list[Camera](), dict[str, list[str]]()  # the names of lens models by what becomes of their cameras
     for camera, distortion in zip(cameras, distortions, strict=True):

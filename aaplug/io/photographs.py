@@ -42,9 +42,7 @@ class Photograph:
         """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.
 
         A photograph may be larger or smaller than the size at which its view was trained, and both were rounded.
-
-        Raises:
-            FormatError: it is not of the camera's shape.
+        Raises FormatError if it is not of the camera's shape.
         """
         (height, width), rounding = self.hw, 1 + max(view.hw) / min(view.hw)  # px of the smaller of the two
         if abs(height - width * view.height / view.width) > rounding * max(1, width / view.width):

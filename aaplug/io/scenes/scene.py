@@ -221,9 +221,7 @@ class Scene:
         size: Gaussians per part.
         faults: receives the faults of rows that are left out and their numbers, and leaves out such rows; None logs
             the number of rows that `drop_bad` leaves out.
-
-        Raises:
-            FormatError: a row cannot be used, and neither `drop_bad` nor `faults` asks to leave it out.
+        Raises FormatError for a row that cannot be used where neither `drop_bad` nor `faults` asks to leave it out.
         """
         dropped, left_out = Counter[str]() if faults is None else faults, 0
         for start in range(0, max(self.count, 1), size):

@@ -249,11 +249,10 @@ def packed(path: Path, scene: Gaussians, version: int, axes: str) -> bytes:
     if old and count > MAX_OLD_GAUSSIANS:
         raise OutputError(path, f"readers take {MAX_OLD_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
     farthest = float(scene.means.abs().max()) if count else 0.0
-    fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
     if farthest >= REACH:
         where = f"positions as far as {farthest:g} from the origin"
         raise OutputError(path, f"cannot hold {where}; move the scene by aaplug merge, or write a .ply")
-    fraction = min(fraction, MAX_WRITTEN_FRACTION)
+    fraction = min(POSITION_BITS - math.frexp(farthest)[1], MAX_WRITTEN_FRACTION)  # the farthest still fits
     warn_of_moves(path, name, scene, (scene.means * 2**fraction).round() / 2**fraction - scene.means)
     warn_of_sizes(path, name, scene, MIN_LOG_SCALE, MIN_LOG_SCALE + 255 / SCALE_STEPS)
     sections = _columns(scene, version, fraction)
