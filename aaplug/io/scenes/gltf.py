@@ -126,15 +126,12 @@ class Primitive:
 
 def _primitives(document: Gltf) -> list[Primitive]:
     nodes, found, count = document.items("nodes"), list[Primitive](), 0
-    motions = dict[int, Float[Tensor, "4 4"]]()
+    motions: dict[int | None, Float[Tensor, "4 4"]] = {None: torch.eye(4, dtype=torch.float64)}
     for index, above in document.parents.items():
-        own = at_rest(nodes[index])
-        motions[index] = own if above is None else motions[above] @ own
+        motions[index] = motions[above] @ at_rest(nodes[index])
     holders = [(index, node) for index, node in enumerate(nodes) if "mesh" in node]
     places = [(document.item("meshes", node, "mesh"), motions[index]) for index, node in holders]
-    if not holders:
-        places = [(mesh, torch.eye(4, dtype=torch.float64)) for mesh in document.items("meshes")]
-    for mesh, motion in places:
+    for mesh, motion in places or [(mesh, motions[None]) for mesh in document.items("meshes")]:
         for each in entries(document.path, "primitive", mesh.value("primitives")):
             primitive = Entry(mesh.place, each.fields)
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
