@@ -1,7 +1,6 @@
 """Scenes and cameras as the command line names them: options, reading, and saying what was read."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 SCENE_FILE = Group("scene file", "How scene files are read.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class FileOptions(Options):
     """How scene files are read."""
 
@@ -36,7 +34,6 @@ class FileOptions(Options):
     """The frames of a scene in time were trained apart: no Gaussian of one is in another."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class SceneOptions(FileOptions):
     """The scene."""
 
@@ -48,7 +45,6 @@ class SceneOptions(FileOptions):
     """Iteration of a model folder (default: the last)."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class CameraOptions(Options):
     """The cameras."""
 

@@ -11,19 +11,19 @@ import pytest
 from aaplug_cli.verbs import VERBS
 
 from aaplug.io.batch_file import read_batch
-from aaplug.options.base import Number, Options, names
+from aaplug.options.base import Argument, Options, names
 from aaplug.system.errors import UsageError
 from tests.conftest import run_python
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
 
-def range_of(hint: Any) -> list[Number]:
+def range_of(hint: Any) -> list[Argument]:
     """The ranges that an annotation states: one for a number, none for others."""
-    return [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Number)]
+    return [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Argument) and ".." in part.takes]
 
 
-def fits(spec: Number, value: Any) -> bool:
+def fits(spec: Argument, value: Any) -> bool:
     """True if a value is not refused."""
     try:
         spec.check("option", value)
@@ -64,7 +64,7 @@ def test_every_number_has_a_range(group, name, specs):
     least, most = map(float, span.split(".."))
 
     def given(value: Any) -> Any:
-        return value if spec.count else [value] * (spec.length or 1)
+        return value if spec.count else [value] * (3 if spec.metavar == "X Y Z" else 1)
 
     for value in NO_NUMBERS:
         inside = isinstance(value, (int, float)) and value is not True and least <= value <= most

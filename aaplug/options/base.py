@@ -11,14 +11,13 @@ from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, cast, dataclass_transform, get_args, get_origin, get_type_hints
 
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
 
-Bound = int | float
 ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # such as https://; a drive of Windows has one letter
 PYTHON_ONLY = "python only"  # marks an option that the command line does not offer
 
@@ -48,6 +47,7 @@ class Argument:
     metavar: stands for the value.  takes: the values that fit, for messages; the metavar if empty.
     read: makes a value of one word, or raises ValueError.  count: number of words; None for one or more.
     flags: other names than the field's, such as -m.  by_place: True if it is given without a name.
+    check: called with the option's name and a value; raises UsageError for one that does not fit.
     """
 
     metavar: str
@@ -56,6 +56,7 @@ class Argument:
     count: int | None = 1
     flags: tuple[str, ...] = ()
     by_place: bool = False
+    check: Callable[[str, Any], object] = lambda option, value: None
 
     def value(self, words: Sequence[str]) -> Any:
         """The value that words give, several of them also between commas; raises ValueError."""
@@ -66,71 +67,16 @@ class Argument:
         values = tuple(map(self.read, words))
         return values[0] if self.count == 1 else values
 
-    def check(self, option: str, value: Any) -> None:
-        """Refuse a value that does not fit; raises UsageError."""
 
+def flag(metavar: str, *flags: str, parsed: Callable[[str, str], object] | None = None, **how: Any) -> Argument:
+    """An option that takes text: any, or what `parsed`, which is given it and the option, does not refuse."""
 
-@dataclass(frozen=True, kw_only=True)
-class Number(Argument):
-    """Takes a number from `least` to `most`, an integer if `whole`; or one or more of them, or `length`."""
-
-    least: Bound
-    most: Bound
-    whole: bool
-    length: int | None = None
-
-    def check(self, option: str, value: Any) -> None:
-        """Refuse what is no number, or outside of the range."""
-        values = [value] if self.count else value
-        listed = isinstance(values, (list, tuple))
-        if value is None or (
-            listed and all(map(self._holds, values)) and len(values) == (self.length or len(values) or 1)
-        ):
-            return
-        got = ", ".join(map(str, values)) if listed else str(value)
-        takes = self.takes if listed else f"a list or tuple of {self.takes.removesuffix(' ...')}"
-        raise UsageError(option, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
-
-    def _holds(self, value: Any) -> bool:
-        kind = Integral if self.whole else Real  # NumPy's too
-        return not isinstance(value, bool) and isinstance(value, kind) and self.least <= cast(float, value) <= self.most
-
-
-@dataclass(frozen=True, kw_only=True)
-class Names(Argument):
-    """Takes a name: one of `others`, or of those in the registry of a kind, of which it takes the objects too."""
-
-    others: tuple[Any, ...] = ()
-    kind: str | None = None
-
-    def check(self, option: str, value: Any) -> None:
-        """Refuse other names, and one that is given twice."""
-        names = [*map(str, self.others), *(names_of(self.kind) if self.kind else ())]
-        values = value if isinstance(value, (list, tuple)) else [value]
-        if len(set(map(str, values))) < len(values):
-            raise UsageError(option, f"names one twice: {', '.join(map(str, values))}")
-        for each in values:
-            name = str(each)[:MAX_VALUE_CHARACTERS]
-            if each is not None and name not in names and (self.kind is None or isinstance(each, str)):
-                raise UsageError(option, not_one_of(name, names))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Text(Argument):
-    """Takes text that `parsed`, which is given it and the option, does not refuse."""
-
-    parsed: Callable[[str, str], object]
-
-    def check(self, option: str, value: Any) -> None:
-        """Refuse other text."""
+    def check(option: str, value: Any) -> None:
         for each in value if isinstance(value, (list, tuple)) else [value]:
-            if isinstance(each, str):
-                self.parsed(each, option)
+            if parsed is not None and isinstance(each, str):
+                parsed(each, option)
 
-
-def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:
-    """An option that takes any word."""
-    return Argument(metavar=metavar, flags=flags, read=read, **how)
+    return Argument(metavar=metavar, flags=flags, check=check, **how)
 
 
 def as_path(word: str) -> Path:
@@ -145,12 +91,27 @@ def as_path(word: str) -> Path:
     return Path(os.path.expanduser(word))
 
 
-def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Names:
-    """An option that takes one of these names, or an entry of a registry."""
-    listed = [*map(str, others), *(names_of(kind) if kind else ())]
+def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Argument:
+    """An option that takes a name: one of these, or of those in the registry of a kind, of which it takes objects too.
+
+    A name that is given twice does not fit.
+    """
     values = {str(name): name for name in others}
-    how = {"read": lambda word: values.get(word, word), "metavar": metavar or "|".join(listed)} | how
-    return Names(others=others, kind=kind, **how)
+
+    def known() -> list[str]:
+        return [*values, *(names_of(kind) if kind else ())]
+
+    def check(option: str, value: Any) -> None:
+        given = value if isinstance(value, (list, tuple)) else [value]
+        if len(set(map(str, given))) < len(given):
+            raise UsageError(option, f"names one twice: {', '.join(map(str, given))}")
+        for each in given:
+            name = str(each)[:MAX_VALUE_CHARACTERS]
+            if each is not None and name not in known() and (kind is None or isinstance(each, str)):
+                raise UsageError(option, not_one_of(name, known()))
+
+    how = {"read": lambda word: values.get(word, word), "metavar": metavar or "|".join(known())} | how
+    return Argument(check=check, **how)
 
 
 def number(
@@ -162,12 +123,16 @@ def number(
     unit: str = "",
     metavar: str = "",
     length: int | None = None,
-) -> Number:
-    """An option that takes a number, or one or more.
+) -> Argument:
+    """An option that takes a number from `least` to `most`, or one or more.
 
     A number that need not be whole may be written as 1/4 or 25%.  unit: may follow it as the word's end.
     metavar: stands for the value in `--help` instead of the range.  length: how many numbers, None for any.
     """
+    kind = Integral if whole else Real  # NumPy's too
+    span = f"{least:.10g}..{most:.10g}"
+    named = f"{metavar}, each " * bool(several and metavar)  # such as X Y Z
+    takes = f"{named}{'a whole number ' * whole}{span}" + " ..." * (several and not named)
 
     def real(word: str) -> float:
         word = word.removesuffix(unit)
@@ -176,17 +141,26 @@ def number(
             raise ValueError(word)
         return float(above) / (float(below) if slash else 1.0) / (100.0 if word.endswith("%") else 1.0)
 
-    span = f"{least:.10g}..{most:.10g}"
-    shown = metavar or span + " ..." * several
-    named = f"{metavar}, each " * bool(several and metavar)  # such as X Y Z
-    takes = f"{named}{'a whole number ' * whole}{span}" + " ..." * (several and not named)
-    how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "whole": whole}
-    return Number(metavar=shown, least=least, most=most, length=length, **how)
+    def holds(value: Any) -> bool:
+        return not isinstance(value, bool) and isinstance(value, kind) and least <= cast(float, value) <= most
+
+    def check(option: str, value: Any) -> None:
+        values = value if several else [value]
+        listed = isinstance(values, (list, tuple))
+        if value is None or (listed and all(map(holds, values)) and len(values) == (length or len(values) or 1)):
+            return
+        got = ", ".join(map(str, values)) if listed else str(value)
+        wanted = takes if listed else f"a list or tuple of {takes.removesuffix(' ...')}"
+        raise UsageError(option, f"takes {wanted}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
+
+    how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "check": check}
+    return Argument(metavar=metavar or span + " ..." * several, **how)
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """The options of a verb.
+    """The options of a verb; a subclass is a dataclass of this kind without being decorated.
 
     Raises:
         UsageError: a value is not of its option's type, a number is outside of its range, or a name is not known.
@@ -194,6 +168,9 @@ class Options:
 
     monitor: Annotated[Monitor, PYTHON_ONLY] = SILENT
     """Receiver of messages and progress."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
         for name, argument in _checks(type(self)).items():

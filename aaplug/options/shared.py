@@ -4,7 +4,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -14,7 +13,7 @@ from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference, SplatOrder
-from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, Text, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -86,7 +85,6 @@ def _check_colour(text: str, where: str) -> None:
         import_module("aaplug.io.images").colour_of(text, where)
 
 
-@dataclass(frozen=True, kw_only=True)
 class FrameOptions(Options):
     """Check that scene and cameras belong together."""
 
@@ -94,13 +92,12 @@ class FrameOptions(Options):
     """Stop if the cameras see less than this share of the Gaussians, or seem of another capture; 0 never stops."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ViewOptions(FrameOptions):
     """Views, background and rasterizer."""
 
     views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
-    background: Annotated[Background, Text(metavar="auto|COLOUR", parsed=_check_colour)] = "auto"
+    background: Annotated[Background, flag("auto|COLOUR", parsed=_check_colour)] = "auto"
     """Colour behind the scene in CSS, such as white or "#ff8000"; auto is that of training."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
@@ -112,7 +109,6 @@ class ViewOptions(FrameOptions):
     """Leave out Gaussians centred outside the image by more than this share of its longer side, if training did."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecipeOptions(ViewOptions):
     """Samples of a recipe, the rate it compares with, and the workers that draw."""
 
@@ -131,7 +127,6 @@ class RecipeOptions(ViewOptions):
         return {"quality": self.quality, "rate_reference": self.rate_reference or "pose", "order": self.order}
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImageOptions(Options):
     """Images by one recipe at one size."""
 
@@ -139,7 +134,7 @@ class ImageOptions(Options):
     """How to render; `aaplug recipes` lists them all."""
     scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size (default: 1)."""
-    resolution: Annotated[str | None, Text(metavar="WxH", parsed=partial(size_of, shape=(1, 1)))] = None
+    resolution: Annotated[str | None, flag("WxH", parsed=partial(size_of, shape=(1, 1)))] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
@@ -161,7 +156,6 @@ class ImageOptions(Options):
         self.need(self.resolution is None, "sets the size, as `resolution` does; give one", "scale")
 
 
-@dataclass(frozen=True, kw_only=True)
 class FilmOptions(RecipeOptions):
     """Aperture and shutter."""
 
@@ -190,7 +184,6 @@ class FilmOptions(RecipeOptions):
         self.need(self.samples != 0, "is ignored by `samples` of 0; give one of the two", "f_stop", "shutter")
 
 
-@dataclass(frozen=True, kw_only=True)
 class LensOptions(Options):
     """The lens."""
 
@@ -209,7 +202,6 @@ class LensOptions(Options):
         self.need(has_angle, "belongs to lenses fisheye and equisolid; name one as `lens`", "lens_angle")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Orbit(Options):
     """Views on an orbit around the scene and, without cameras, the training that is assumed."""
 
@@ -225,7 +217,7 @@ class Orbit(Options):
     """Place to look from, X Y Z, instead of an orbit."""
     up: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Direction that points up, X Y Z (default: 0 -1 0, or what file and colours say)."""
-    train_view: Annotated[str | None, Text(metavar="WxH", parsed=size_of), ORBIT] = None
+    train_view: Annotated[str | None, flag("WxH", parsed=size_of), ORBIT] = None
     """Assumed size in px of the training images, which show what the orbit shows (default: 1600x1066)."""
     train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), ORBIT] = None
     """Instead, training's px per world unit in the middle of the scene."""

@@ -1,26 +1,12 @@
 """Options of each verb."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.io import MOST_FPS, StreamName
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import (
-    DRAWING,
-    FILES,
-    FILM,
-    PYTHON_ONLY,
-    REPORT,
-    TUNING,
-    Options,
-    Text,
-    as_path,
-    flag,
-    names,
-    number,
-)
+from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, as_path, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -61,7 +47,6 @@ MOST_FIRST_FRAME = 10**9
 SHOWN_VIEWS = flag("N|NAME,...")
 
 
-@dataclass(frozen=True, kw_only=True)
 class WritingOptions(Options):
     """A scene file to write."""
 
@@ -71,7 +56,6 @@ class WritingOptions(Options):
     """Replace existing outputs."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering."""
 
@@ -86,7 +70,6 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
         self.need(self.samples != 0, "opens a shutter, which `samples` of 0 ignores; give one of the two", "camera_to")
 
 
-@dataclass(frozen=True, kw_only=True)
 class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering, and the camera path."""
 
@@ -119,7 +102,6 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(RecipeOptions):
     """Recipes, scales, truth and metrics."""
 
@@ -157,7 +139,6 @@ class EvaluateOptions(RecipeOptions):
         self.need(self.report, "selects views of the report; give `report`, too", "show")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CompareOptions(RecipeOptions):
     """Sizes, metrics and how the scenes are shown."""
 
@@ -183,7 +164,6 @@ class CompareOptions(RecipeOptions):
         self.need(self.viewer is None, "is set by `viewer`; give one of the two", "recipe")
 
 
-@dataclass(frozen=True, kw_only=True)
 class ConvertOptions(WritingOptions, ViewOptions):
     """The filter to fuse, and how to measure the result."""
 
@@ -207,7 +187,6 @@ class ConvertOptions(WritingOptions, ViewOptions):
 IN_TIME = (RenderOptions, VideoOptions, EvaluateOptions, ConvertOptions)  # of the verbs that take a scene in time
 
 
-@dataclass(frozen=True, kw_only=True)
 class MergeOptions(WritingOptions, FrameOptions):
     """Where each scene goes, and by which rule the file is to be drawn."""
 
@@ -221,7 +200,6 @@ class MergeOptions(WritingOptions, FrameOptions):
     """For each scene: factor on its size, about the origin of its file; 1 for none."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class LodOptions(WritingOptions, ViewOptions):
     """How light, and how to tune."""
 
@@ -278,7 +256,6 @@ class LodOptions(WritingOptions, ViewOptions):
         return (usual if self.steps is None else self.steps) if self.refine else 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class FinetuneOptions(WritingOptions, ViewOptions):
     """The optimization."""
 
@@ -320,7 +297,6 @@ class FinetuneOptions(WritingOptions, ViewOptions):
         self.need(self.method == USUAL_METHOD, f"is a method of its own, beside {self.method}", "learn_filters")
 
 
-@dataclass(frozen=True, kw_only=True)
 class PoseOptions(ViewOptions):
     """Whose poses to refine."""
 
@@ -328,7 +304,6 @@ class PoseOptions(ViewOptions):
     """Views with photographs, by name or split."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class LiveOptions(ViewOptions):
     """The page, and how the scene is drawn."""
 
@@ -342,7 +317,6 @@ class LiveOptions(ViewOptions):
     """Words of a command line that name the scene and its cameras, for the page to show."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ConformOptions(Options):
     """The expected pictures."""
 
@@ -352,7 +326,6 @@ class ConformOptions(Options):
     """Replace existing outputs."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class BenchOptions(Options):
     """The scenes and sizes to time."""
 
@@ -362,7 +335,7 @@ class BenchOptions(Options):
         1_000_000,
     )
     """Sizes of the synthetic scenes."""
-    resolution: Annotated[Sequence[str] | None, Text(metavar="WxH ...", parsed=size_of, count=None)] = None
+    resolution: Annotated[Sequence[str] | None, flag("WxH ...", parsed=size_of, count=None)] = None
     """Image sizes; only the middle scene takes all, others the first (default: the view's or 800x800 1600x1060)."""
     rasterizer: Literal["all", "compiled", "eager"] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
