@@ -1,7 +1,6 @@
 """The program's output: log and progress on stderr, data on stdout."""
 
 import logging
-import math
 import os
 import sys
 import time
@@ -123,51 +122,39 @@ class Terminal(Monitor):
     @contextmanager
     def progress(self, what: str, unit: str) -> Iterator[Tell]:
         """Show progress, rate, workers and the time left."""
+        started: tuple[float, int] | None = None
+        told = time.monotonic()
+
+        def pace(done: int) -> tuple[float, str]:
+            """How many are done a second since the first call, as what an earlier run did does not count; and words."""
+            nonlocal started
+            now = time.monotonic()
+            since, before = started = started or (now, done)
+            rate = (done - before) / (now - since) if now > since else 0.0
+            words = f", {rate:,{'.3g' if rate < 100 else '.0f'}} a second" if rate else ""
+            return rate, words + self._workers
+
+        def tell_log(done: int, total: int) -> None:
+            nonlocal told
+            now, (rate, words) = time.monotonic(), pace(done)
+            if done == total or now - told >= LINE_SECONDS:
+                eta = f", about {(total - done) / rate:.0f} s left" if rate and done < total else ""
+                all_of = counted(total, unit[:-1]) if unit.endswith("s") else f"{total} {unit}"
+                say(f"{what}: {done:,} of {all_of}{words}{eta}")
+                told = now
+
         if not log().is_terminal:
-            yield self._lines(what, unit)
+            yield tell_log
             return
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         named = TextColumn("{task.fields[what]}", markup=False)  # a name may look like markup, or like a field
         columns = (named, BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
         with Progress(*columns, TimeRemainingColumn(), console=log(), transient=True) as bar:
-            task, rate = bar.add_task(unit, total=None, what=printable(what)), _Rate()
-
-            def tell(done: int, total: int) -> None:
-                bar.update(task, completed=done, total=total, description=f"{unit}{rate(done)}{self._workers}")
-
-            yield tell
-
-    def _lines(self, what: str, unit: str) -> Tell:
-        """Progress for logs: a line every LINE_SECONDS and one at the end."""
-        rate, told = _Rate(), time.monotonic()
-
-        def tell(done: int, total: int) -> None:
-            nonlocal told
-            now, pace = time.monotonic(), rate(done)
-            if done == total or now - told >= LINE_SECONDS:
-                eta = f", about {(total - done) / rate.value:.0f} s left" if rate.value and done < total else ""
-                all_of = counted(total, unit[:-1]) if unit.endswith("s") else f"{total} {unit}"
-                say(f"{what}: {done:,} of {all_of}{pace}{self._workers}{eta}")
-                told = now
-
-        return tell
-
-
-class _Rate:
-    """How many are done a second, since the first call: what an earlier run did does not count."""
-
-    def __init__(self) -> None:
-        self.value, self._start = 0.0, (math.nan, 0)
-
-    def __call__(self, done: int) -> str:
-        """In words, once there is a rate."""
-        now = time.monotonic()
-        if math.isnan(self._start[0]):
-            self._start = now, done
-        since, before = self._start
-        self.value = (done - before) / (now - since) if now > since else 0.0
-        return f", {self.value:,{'.3g' if self.value < 100 else '.0f'}} a second" if self.value else ""
+            task = bar.add_task(unit, total=None, what=printable(what))
+            yield lambda done, total: bar.update(
+                task, completed=done, total=total, description=f"{unit}{pace(done)[1]}"
+            )
 
 
 TERMINAL = Terminal()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, undivided
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError, counted
@@ -76,22 +76,23 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
     entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
     f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-    cam_from_world = inverse(pose_of_opengl(motion, entry.place, "camera_to_world"))
+    turn, centre = motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3]
+    cam_from_world = inverse(pose(turn, centre, entry.place, "camera_to_world"))
     exact = {
         field: entry.get(key, number if key in ("cx", "cy") else focal)
         for key, field in EXACT.items()
         if entry.fields.get(key) is not None
     }
-    return replace(centred(name, size, f, cam_from_world), **exact, exposure=_exposure(entry))
-
-
-def _exposure(entry: Entry) -> Exposure | None:
-    if entry.fields.get("aperture") is None:
-        return None
-    about = entry.entry("aperture")
-    radius, focus = about.get("radius", number), about.get("focus", number)
-    blades = about.get("blades", number, 0.0)
-    try:
-        return Exposure(Aperture(radius, focus, int(blades)))
-    except UsageError as error:
-        raise entry.place.error(f"aperture: {error}") from error
+    exposure = None
+    if entry.fields.get("aperture") is not None:
+        about = entry.entry("aperture")
+        radius, focus, blades = (
+            about.get("radius", number),
+            about.get("focus", number),
+            about.get("blades", number, 0.0),
+        )
+        try:
+            exposure = Exposure(Aperture(radius, focus, int(blades)))
+        except UsageError as error:
+            raise entry.place.error(f"aperture: {error}") from error
+    return replace(centred(name, size, f, cam_from_world), **exact, exposure=exposure)

@@ -125,31 +125,22 @@ def read_images(file: Path) -> list[Image]:
     return images
 
 
-class _Reader:
-    """A binary file whose remaining size is checked before each read."""
+def _unpacked(file: Path, stream: BinaryIO, record: struct.Struct, what: str) -> tuple[Any, ...]:
+    """One record of fixed size."""
+    data = stream.read(record.size)
+    if len(data) < record.size:
+        raise FormatError(file, f"{what}: {record.size} bytes expected, {len(data)} left; the file is cut short")
+    return record.unpack(data)
 
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file, self.size = path, file, os.fstat(file.fileno()).st_size
 
-    @property
-    def left(self) -> int:
-        """Bytes that were not read yet."""
-        return self.size - self.file.tell()
-
-    def unpack(self, record: struct.Struct, what: str) -> tuple[Any, ...]:
-        """One record of fixed size."""
-        size = record.size
-        if size > self.left:
-            raise FormatError(self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short")
-        return record.unpack(self.file.read(size))
-
-    def count(self, least: int, what: str) -> int:
-        """A number of records, checked against the bytes that are left, `least` or more for each."""
-        (n,) = self.unpack(COUNT_RECORD, f"number of {what}")
-        if n * least > self.left:
-            need = f"{n} {what} need {n * least} bytes at least, and {self.left} are left"
-            raise FormatError(self.path, f"{need}; the file is cut short or is not COLMAP's")
-        return n
+def _count(file: Path, stream: BinaryIO, least: int, what: str) -> int:
+    """A number of records, checked against the bytes that are left, `least` or more for each."""
+    (n,) = _unpacked(file, stream, COUNT_RECORD, f"number of {what}")
+    left = os.fstat(stream.fileno()).st_size - stream.tell()
+    if n * least > left:
+        need = f"{n} {what} need {n * least} bytes at least, and {left} are left"
+        raise FormatError(file, f"{need}; the file is cut short or is not COLMAP's")
+    return n
 
 
 def _records(file: Path, binary: Parser[Record], lines: Parser[Record]) -> Iterator[Record]:
@@ -161,30 +152,29 @@ def _records(file: Path, binary: Parser[Record], lines: Parser[Record]) -> Itera
 
 
 def _binary_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
-    reader = _Reader(file, stream)
-    for index in range(reader.count(MIN_CAMERA_SIZE, "cameras")):
-        key, model_id, width, height = reader.unpack(CAMERA_RECORD, f"camera record {index}")
-        place = Place(reader.path, f"camera {key}")
+    for index in range(_count(file, stream, MIN_CAMERA_SIZE, "cameras")):
+        what = f"camera record {index}"
+        key, model_id, width, height = _unpacked(file, stream, CAMERA_RECORD, what)
+        place = Place(file, f"camera {key}")
         if not 0 <= model_id < len(MODELS):
             raise place.wrong("model", f"COLMAP's, 0 to {len(MODELS) - 1}", model_id)
         model = MODELS[model_id]
-        parameters = reader.unpack(struct.Struct(f"<{model.parameters}d"), f"camera record {index}")
+        parameters = _unpacked(file, stream, struct.Struct(f"<{model.parameters}d"), what)
         yield Intrinsics(place, key, model, width, height, parameters)
 
 
 def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
-    reader = _Reader(file, stream)
-    for index in range(reader.count(MIN_IMAGE_SIZE, "images")):
+    for index in range(_count(file, stream, MIN_IMAGE_SIZE, "images")):
         what = f"image record {index}"
-        key, *motion, camera_id = reader.unpack(IMAGE_RECORD, what)
-        place = Place(reader.path, f"image {key}")
+        key, *motion, camera_id = _unpacked(file, stream, IMAGE_RECORD, what)
+        place = Place(file, f"image {key}")
         start, most = stream.tell(), whole_limit("NAME")
-        chunk = stream.read(min(most + 1, reader.left))
+        chunk = stream.read(most + 1)
         name, end, _ = chunk.partition(b"\0")
         if not end:
             raise FormatError(file, f"{what}: its name should end within {most} bytes, not after {len(chunk)}")
         stream.seek(start + len(name) + 1)
-        stream.seek(reader.count(POINT_SIZE, f"points of {what}") * POINT_SIZE, os.SEEK_CUR)
+        stream.seek(_count(file, stream, POINT_SIZE, f"points of {what}") * POINT_SIZE, os.SEEK_CUR)
         yield Image(place, text(_decoded(name, place), place, "name"), camera_id, tuple(motion[:4]), tuple(motion[4:]))
 
 

@@ -61,8 +61,8 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     poses = torch.stack([pose(turn, where, place, "its transform") for turn, where in rows])
     tangent, aspect = _lens(file, nodes[chosen])
     size = max(1, round(UNSIZED[1] * aspect)), UNSIZED[1]
-    cameras = cameras_of(poses, torch.full((len(at),), tangent), lambda size: size[1], place, size)
-    return CameraPath(cameras, fps, unsized=True)
+    focals = size[1] / 2 / torch.full((len(at),), tangent, dtype=torch.float64)
+    return CameraPath(cameras_of(poses, focals, place, size), fps, unsized=True)
 
 
 Channel = tuple[Tensor, Tensor, str]  # times in s, values, interpolation

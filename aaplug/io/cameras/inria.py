@@ -19,7 +19,7 @@ from aaplug.io.cameras.cfg_args import UNKNOWN, WIDTH_CAP, CfgArgs, read_cfg_arg
 from aaplug.io.cameras.photos import photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions
-from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
+from aaplug.io.values import Place, entries, focal, mentions, pixels, read_json, text
 
 FILE = "cameras.json"
 
@@ -42,7 +42,17 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     run = folder / cfg_args.NAME
     settings = read_cfg_args(run) if os.path.isfile(run) else UNKNOWN
     photos = photo_folder(folder, options, settings.images, Place(run, "images"))
-    source = with_photos([_camera(item) for item in items], [item.place for item in items], photos)
+    source = list[Camera]()
+    for item in items:
+        rotation, position = item.matrix("rotation", 3, 3), item.vector("position", 3)
+        size, fx, fy = (
+            (item.get("width", pixels), item.get("height", pixels)),
+            item.get("fx", focal),
+            item.get("fy", focal),
+        )
+        cam_from_world = inverse(pose(rotation, position, item.place, "rotation"))
+        source.append(replace(centred(item.get("img_name", text), size, fx, cam_from_world), fy=fy))
+    source = with_photos(source, [item.place for item in items], photos)
     views = dict[tuple[object, ...], Camera]()
     for camera in source:  # some runs list a view once per split
         views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
@@ -73,14 +83,6 @@ class Model:
         """True for a folder that holds both files, or its cfg_args."""
         folder = path.parent if path.name == cfg_args.NAME else path
         return all(os.path.isfile(folder / file) for file in (FILE, cfg_args.NAME))
-
-
-def _camera(entry: Entry) -> Camera:
-    rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
-    size = entry.get("width", pixels), entry.get("height", pixels)
-    fx, fy = entry.get("fx", focal), entry.get("fy", focal)
-    cam_from_world = inverse(pose(rotation, position, entry.place, "rotation"))
-    return replace(centred(entry.get("img_name", text), size, fx, cam_from_world), fy=fy)
 
 
 def _trained(cameras: Sequence[Camera], run: CfgArgs, options: CameraFileOptions) -> tuple[list[Camera], str]:

@@ -4,7 +4,6 @@ n: keys.  f: frames.  Every function raises FormatError.
 """
 
 import math
-from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
@@ -74,18 +73,8 @@ def unit(quats: Float[Tensor, "n 4"], place: Place) -> Float[Tensor, "n 4"]:
 
 
 def cameras_of(
-    world_from_cam: Float[Tensor, "f 4 4"],
-    tangents: Float[Tensor, " f"],
-    side: Callable[[tuple[int, int]], float],
-    place: Place,
-    size: tuple[int, int] = UNSIZED,
+    world_from_cam: Float[Tensor, "f 4 4"], focals: Float[Tensor, " f"], place: Place, size: tuple[int, int] = UNSIZED
 ) -> tuple[Camera, ...]:
-    """Cameras named by number.
-
-    world_from_cam: rigid, OpenCV axes.  tangents: of half the angle of view along the side that `side` picks.
-    """
-    cameras = []
-    for name, pose, tangent in zip(numbered(len(tangents)), world_from_cam, tangents.tolist(), strict=True):
-        f = focal(side(size) / 2 / tangent if tangent else math.inf, place, "the focal length")
-        cameras.append(centred(name, size, f, inverse(pose)))
-    return tuple(cameras)
+    """Cameras named by number.  world_from_cam: rigid, OpenCV axes.  focals: focal lengths, in px."""
+    rows = zip(numbered(len(focals)), world_from_cam, focals.tolist(), strict=True)
+    return tuple(centred(name, size, focal(f, place, "the focal length"), inverse(pose)) for name, pose, f in rows)

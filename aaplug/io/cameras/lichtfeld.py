@@ -12,7 +12,7 @@ import torch
 
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.keyframes import FPS, cameras_of, frame_times, hermite, rising, segments, slerp, unit
+from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, rising, segments, slerp, unit
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL
 from aaplug.io.values import entries, mentions, number, object_of, read_json
 
@@ -57,6 +57,5 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     motions = torch.eye(4, dtype=torch.float64).repeat(len(at), 1, 1)
     turns = rotation_matrices(slerp(quats[index], quats[after], share).roll(1, dims=1))
     motions[:, :3, :3], motions[:, :3, 3] = WORLD[:, None] * turns * OPENCV_FROM_OPENGL, WORLD * points
-    tangents = SENSOR_HEIGHT / 2 / focals[index].lerp(focals[after], share)
-    cameras = cameras_of(motions, tangents, lambda size: size[1], about.place)
-    return CameraPath(cameras, fps, unsized=True)
+    focals = UNSIZED[1] / SENSOR_HEIGHT * focals[index].lerp(focals[after], share)
+    return CameraPath(cameras_of(motions, focals, about.place), fps, unsized=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import WHITE
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
-from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.poses import inverse, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, explicit, undivided
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
 from aaplug.system.errors import UsageError, counted
@@ -60,6 +60,6 @@ def _cameras(document: Entry, split: str) -> list[Camera]:
     folder, cameras = PhotoFolder(file.parent, file.parent), list[Camera]()
     for item, name, photo in zip(items, names, paths, strict=True):
         size, f = (item.get("width", pixels), item.get("height", pixels)), item.get("focal", focal)
-        cam_from_world = inverse(pose_of_opengl(rigid(item, "cam2world"), item.place, "cam2world"))
+        cam_from_world = inverse(rigid(item, "cam2world", opengl=True))
         cameras.append(centred(name, size, f, cam_from_world, folder.find(photo, item.place)))
     return cameras

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, numbered
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import pose, rigid
+from aaplug.io.cameras.poses import rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
-from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
+from aaplug.io.values import entries, focal, mentions, number, pixels, read_json
 
 name = "pinhole"
 sign = "a JSON file with world_to_camera"
@@ -25,15 +25,11 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     alone = isinstance(document, dict)
     items = entries(path, "camera", [document] if alone else document)
     names = [path.stem] if alone else numbered(len(items), "camera_")
-    source = [_camera(item, name) for item, name in zip(items, names, strict=True)]
+    source = list[Camera]()
+    for item, name in zip(items, names, strict=True):
+        width, height = item.get("width", pixels), item.get("height", pixels)
+        fx, fy, cx, cy = item.get("fx", focal), item.get("fy", focal), item.get("cx", number), item.get("cy", number)
+        source.append(Camera(name, width, height, fx, fy, cx, cy, rigid(item, "world_to_camera")))
     trained, why = at_file_size(source, options)
     split = every_nth(trained, options, 0, "the format has no split")
     return camera_set("pinhole JSON", source, split, why)
-
-
-def _camera(entry: Entry, name: str) -> Camera:
-    motion = rigid(entry, "world_to_camera")
-    cam_from_world = pose(motion[:3, :3], motion[:3, 3], entry.place, "world_to_camera")
-    width, height = entry.get("width", pixels), entry.get("height", pixels)
-    fx, fy, cx, cy = entry.get("fx", focal), entry.get("fy", focal), entry.get("cx", number), entry.get("cy", number)
-    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world)

@@ -11,12 +11,9 @@ from torch import Tensor
 from aaplug.core.cameras import MAX_ROTATION_ERROR, rigid_motion
 from aaplug.io.values import Entry, Place
 
-OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
-
-
-def pose_of_opengl(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
-    """`world_from_cam` from a camera-to-world matrix whose camera axes are OpenGL's (x right, y up, z backward)."""
-    return pose(motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3], place, field)
+OPENCV_FROM_OPENGL = torch.tensor(
+    [1.0, -1.0, -1.0], dtype=torch.float64
+)  # y and z change sign; multiplies columns of camera-to-world rotations
 
 
 def pose(
@@ -39,9 +36,12 @@ def inverse(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     return rigid_motion(back, -back @ motion[:3, 3])
 
 
-def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
-    """A field that holds a 4×4 matrix whose last row is 0 0 0 1."""
+def rigid(entry: Entry, field: str, opengl: bool = False) -> Float[Tensor, "4 4"]:
+    """The rigid motion of a field that holds a 4×4 matrix, whose last row is 0 0 0 1.
+
+    opengl: the matrix is camera-to-world with OpenGL's axes of the camera (x right, y up, z backward).
+    """
     motion = entry.matrix(field, 4, 4)
     right = torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3])
     entry.place.expect(right, f"{field}'s last row", "0 0 0 1", motion[3].tolist())
-    return motion
+    return pose(motion[:3, :3] * (OPENCV_FROM_OPENGL if opengl else 1.0), motion[:3, 3], entry.place, field)

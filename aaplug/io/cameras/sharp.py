@@ -5,13 +5,12 @@ px; intrinsic, a 3×3 matrix in px, row by row; extrinsic, `cam_from_world`, 4×
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import pose, rigid
+from aaplug.io.cameras.poses import rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
 from aaplug.io.ply_header import BIG, TEXT, Header, check_size, read_header
 from aaplug.io.values import Entry, Place, focal, number, pixels, read_part, read_start
@@ -45,22 +44,20 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     refuse_folder(options)
     header = read_header(path)
     check_size(header, path.stat().st_size)
-    entry = Entry(Place(path, "its camera"), {table: _values(path, header, table) for table in SHAPES})
-    motion, intrinsic = rigid(entry, "extrinsic"), entry.value("intrinsic")
+    entry = Entry(Place(path, "its camera"), {})
+    for element in header.elements:
+        if element.name in SHAPES:
+            dtype = element.dtype.newbyteorder(">" if header.coding == BIG else "<")
+            data = read_part(path, header.start_of(element), element.least_size)
+            values = np.frombuffer(data, dtype)[element.name]
+            entry.fields[element.name] = values.reshape(SHAPES[element.name]).tolist()
+    cam_from_world, intrinsic = rigid(entry, "extrinsic"), entry.value("intrinsic")
     (fx, skew, cx), (zero, fy, cy), last = intrinsic
     entry.place.expect([skew, zero, *last] == [0, 0, 0, 0, 1], "intrinsic", "[[fx 0 cx] [0 fy cy] [0 0 1]]", intrinsic)
     width, height = (pixels(side, entry.place, "image_size") for side in entry.value("image_size"))
     fx, fy = (focal(value, entry.place, "intrinsic") for value in (fx, fy))
     cx, cy = (number(value, entry.place, "intrinsic") for value in (cx, cy))
-    cam_from_world = pose(motion[:3, :3], motion[:3, 3], entry.place, "extrinsic")
     source = [Camera(path.stem, width, height, fx, fy, cx, cy, cam_from_world)]
     trained, why = at_file_size(source, options)
     why = "the photograph's" if options.train_scale is None else why  # whose width nothing caps
     return camera_set("SHARP's photograph", source, every_nth(trained, options, 0, "one photograph"), why)
-
-
-def _values(path: Path, header: Header, table: str) -> list[Any]:
-    element = next(element for element in header.elements if element.name == table)
-    data = read_part(path, header.start_of(element), element.least_size)
-    dtype = element.dtype.newbyteorder(">" if header.coding == BIG else "<")
-    return np.frombuffer(data, dtype)[table].reshape(SHAPES[table]).tolist()

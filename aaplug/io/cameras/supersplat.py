@@ -19,7 +19,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import look_at
 from aaplug.io.cameras.camera_path import MAX_ANGLE, CameraPath
-from aaplug.io.cameras.keyframes import FPS, cameras_of, frame_times, hermite, rising, segments
+from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, rising, segments
 from aaplug.io.values import Entry, entries, mentions, number, numbers, object_of, read_json
 from aaplug.system.errors import UsageError
 
@@ -62,8 +62,8 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
         poses = torch.stack([look_at(eye, target, UP) for eye, target in zip(eyes, targets, strict=True)])
     except UsageError as error:
         raise about.place.error(f"position and target: {error}") from error
-    tangents = torch.tan(torch.deg2rad(angles) / 2)
-    return CameraPath(cameras_of(torch.linalg.inv(poses), tangents, max, about.place), fps, unsized=True)
+    focals = max(UNSIZED) / 2 / torch.tan(torch.deg2rad(angles) / 2)
+    return CameraPath(cameras_of(torch.linalg.inv(poses), focals, about.place), fps, unsized=True)
 
 
 def _keys(about: Entry, keys: Entry) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 7"]]:

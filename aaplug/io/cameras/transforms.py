@@ -25,7 +25,7 @@ from aaplug.core.colours import WHITE
 from aaplug.core.lenses import EQUIRECT, opencv_lens
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, refuse_folder, without_suffix
-from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
+from aaplug.io.cameras.poses import inverse, pose, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import image_size, is_transparent
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
@@ -192,7 +192,7 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
         fx, fy = _focal(entry, "x", width), _focal(entry, "y", height)
         fx = fx or fy or entry.get("fl_x", focal)  # which is missing
         fy, cx, cy = fy or fx, entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
-    world_from_cam = pose_of_opengl(rigid(entry, "transform_matrix"), entry.place, "transform_matrix")
+    world_from_cam = rigid(entry, "transform_matrix", opengl=True)
     if parser is not None:
         world_from_cam = parser[0] @ world_from_cam
         world_from_cam[:3, 3] *= parser[1]

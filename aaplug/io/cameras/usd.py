@@ -6,7 +6,6 @@ the stage's framesPerSecond, else its time codes.  Layers that the file names mu
 before the stage is composed.
 """
 
-import math
 import os
 from importlib import import_module
 from pathlib import Path
@@ -14,10 +13,10 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import WHOLE_SLACK, Aperture, Camera, Exposure, numbered
+from aaplug.core.cameras import Aperture, Camera, Exposure, numbered
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
-from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.cameras.keyframes import UNSIZED, frame_times
+from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
 from aaplug.io.values import Place, focal, number
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.extras import check_installed
@@ -57,9 +56,8 @@ def _read(path: Path, fps: float | None) -> CameraPath:
     fps = fps or rate
     if stage.HasAuthoredTimeCodeRange() and moving:
         first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
-        steps = (last - first) * fps / codes
-        place.expect(0 <= steps < MAX_FRAMES, "time codes", f"a range of at most {MAX_FRAMES:,} frames", [first, last])
-        times = [Usd.TimeCode(first + step * codes / fps) for step in range(math.floor(steps + WHOLE_SLACK) + 1)]
+        place.expect(first <= last, "time codes", "rising", [first, last])
+        times = list(map(Usd.TimeCode, frame_times(first, last, fps / codes, place).tolist()))
     elif moving:
         raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
     named = zip(numbered(len(times)), times, strict=True)
@@ -117,14 +115,14 @@ def _camera(name: str, camera: Any, time: Any, place: Place) -> tuple[Camera, fl
     cy = height / 2 + value("VerticalApertureOffset") * rate
     rows = [list(row) for row in camera.ComputeLocalToWorldTransform(time)]
     motion = torch.tensor(rows, dtype=torch.float64).T
-    motion[:3, :3] /= motion[:3, :3].norm(dim=0)
-    place.expect(bool(motion.isfinite().all()), "its transform", "finite", rows)
-    pose = inverse(pose_of_opengl(motion, place, "its transform"))
+    turn = motion[:3, :3] / motion[:3, :3].norm(dim=0) * OPENCV_FROM_OPENGL
+    place.expect(bool(motion.isfinite().all() and turn.isfinite().all()), "its transform", "finite", rows)
+    cam_from_world = inverse(pose(turn, motion[:3, 3], place, "its transform"))
     stop, focus = value("FStop"), value("FocusDistance")
     shutter = value("ShutterClose") - value("ShutterOpen")
     try:
         aperture = Exposure(Aperture(length / UNIT / stop / 2, focus)) if stop > 0 and focus > 0 else None
-        view = Camera(name, width, height, f, f, cx, cy, pose, exposure=aperture)
+        view = Camera(name, width, height, f, f, cx, cy, cam_from_world, exposure=aperture)
     except UsageError as error:
         raise place.error(str(error)) from error
     return view, shutter
