@@ -86,11 +86,8 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
     exposure = None
     if entry.fields.get("aperture") is not None:
         about = entry.entry("aperture")
-        radius, focus, blades = (
-            about.get("radius", number),
-            about.get("focus", number),
-            about.get("blades", number, 0.0),
-        )
+        radius, focus = about.get("radius", number), about.get("focus", number)
+        blades = about.get("blades", number, 0.0)
         try:
             exposure = Exposure(Aperture(radius, focus, int(blades)))
         except UsageError as error:

@@ -57,7 +57,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     folders = dict.fromkeys((root, folder.absolute()))
     lists = [name for each in folders for name in SPLIT_LISTS if os.path.isfile(each / name)]
     unread = [f"lists of views, not read: {', '.join(lists)}"] if lists else []
-    more = [*photos.notes(source), *_other_models(folder), *unread]
+    models = {file.parent.name for kind in KINDS for file in folder.parent.glob(f"[0-9]*/images{kind}")}
+    others = sorted(models - {folder.name}) if folder.name.isdigit() else []  # parts that COLMAP could not join
+    beside = [f"other models beside {folder.name}, not read: {listing(others)}"] if others else []
+    more = [*photos.notes(source), *beside, *unread]
     names = distinct(images_file, [image.name for image in images], (without_suffix, str))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     trained, why = sets.at_photo_size(source, options)
@@ -74,13 +77,6 @@ def _model_folder(path: Path) -> Path | None:
         return path.parent if in_model else None
     tries = (path / "sparse" / "0", path / "sparse", path / "0", path)
     return next((t for t in tries if any(os.path.isfile(t / f"cameras{k}") for k in KINDS)), None)
-
-
-def _other_models(folder: Path) -> list[str]:
-    """A note on models beside this one of a folder that numbers them: parts that COLMAP could not join."""
-    there = {file.parent.name for kind in KINDS for file in folder.parent.glob(f"[0-9]*/images{kind}")}
-    others = sorted(there - {folder.name}) if folder.name.isdigit() else []
-    return [f"other models beside {folder.name}, not read: {listing(others)}"] if others else []
 
 
 def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:

@@ -5,10 +5,9 @@ vertical angle in rad.  Of an animation, the motions of the camera's node and th
 is that of the densest even keys, else 30 a second.  Focal lengths that KHR_animation_pointer moves stay.
 """
 
+import math
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -59,9 +58,16 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     axes = motions[:, :3, :3] / motions[:, :3, :3].norm(dim=1, keepdim=True)
     rows = zip(axes * OPENCV_FROM_OPENGL, motions[:, :3, 3], strict=True)
     poses = torch.stack([pose(turn, where, place, "its transform") for turn, where in rows])
-    tangent, aspect = _lens(file, nodes[chosen])
+    camera = file.item("cameras", nodes[chosen], "camera")
+    kind = camera.fields.get("type")
+    camera.place.expect(kind == "perspective", "type", "perspective", kind)
+    lens = camera.entry("perspective")
+    angle = lens.get("yfov", number)
+    lens.place.expect(0 < angle < math.pi, "yfov", "above 0 and below π, in radians", angle)
+    aspect = lens.get("aspectRatio", number, UNSIZED[0] / UNSIZED[1])
+    lens.place.expect(1 / 64 <= aspect <= 64, "aspectRatio", "from 1/64 to 64", aspect)
     size = max(1, round(UNSIZED[1] * aspect)), UNSIZED[1]
-    focals = size[1] / 2 / torch.full((len(at),), tangent, dtype=torch.float64)
+    focals = size[1] / 2 / torch.full((len(at),), angle / 2, dtype=torch.float64).tan()
     return CameraPath(cameras_of(poses, focals, place, size), fps, unsized=True)
 
 
@@ -94,18 +100,18 @@ def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
 
 def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -> Float[Tensor, "f 4 4"]:
     """A node's own motion at these times."""
-    hidden = ("matrix", "scale") if channels else ()
+    hidden = {"matrix", *channels} if channels else ()
     own = Entry(node.place, {key: value for key, value in node.fields.items() if key not in hidden})
     motions = at_rest(own).repeat(len(at), 1, 1)
     if "translation" in channels:
         motions[:, :3, 3] = _sampled(channels["translation"], at, node.place, False)
     if "rotation" in channels:
         quats = keyframes.unit(_sampled(channels["rotation"], at, node.place, True), node.place)
-        motions[:, :3, :3] = rotation_matrices(quats.roll(1, dims=1))
+        motions[:, :3, :3] = (
+            rotation_matrices(quats.roll(1, dims=1)) @ motions[:, :3, :3]
+        )  # that hold the scale at rest
     if "scale" in channels:
         motions[:, :3, :3] *= _sampled(channels["scale"], at, node.place, False)[:, None]
-    elif channels and "scale" in node:
-        motions[:, :3, :3] *= node.vector("scale", 3)
     return motions
 
 
@@ -132,16 +138,3 @@ def _rate(times: Float[Tensor, " n"]) -> float:
         return 0.0
     rate = round(1 / float(steps.mean()), 3)
     return min(MAX_RATE, rate) if rate >= MIN_RATE else 0.0
-
-
-def _lens(file: Gltf, node: Entry) -> tuple[float, float]:
-    """Tangent of half the vertical angle, and width over height."""
-    camera = file.item("cameras", node, "camera")
-    kind: Any = camera.fields.get("type")
-    camera.place.expect(kind == "perspective", "type", "perspective", kind)
-    lens = camera.entry("perspective")
-    angle = lens.get("yfov", number)
-    lens.place.expect(0 < angle < np.pi, "yfov", "above 0 and below π, in radians", angle)
-    aspect = lens.get("aspectRatio", number, UNSIZED[0] / UNSIZED[1])
-    lens.place.expect(1 / 64 <= aspect <= 64, "aspectRatio", "from 1/64 to 64", aspect)
-    return float(np.tan(angle / 2)), aspect

@@ -45,11 +45,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = list[Camera]()
     for item in items:
         rotation, position = item.matrix("rotation", 3, 3), item.vector("position", 3)
-        size, fx, fy = (
-            (item.get("width", pixels), item.get("height", pixels)),
-            item.get("fx", focal),
-            item.get("fy", focal),
-        )
+        size = item.get("width", pixels), item.get("height", pixels)
+        fx, fy = item.get("fx", focal), item.get("fy", focal)
         cam_from_world = inverse(pose(rotation, position, item.place, "rotation"))
         source.append(replace(centred(item.get("img_name", text), size, fx, cam_from_world), fy=fy))
     source = with_photos(source, [item.place for item in items], photos)

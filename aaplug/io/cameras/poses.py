@@ -11,9 +11,7 @@ from torch import Tensor
 from aaplug.core.cameras import MAX_ROTATION_ERROR, rigid_motion
 from aaplug.io.values import Entry, Place
 
-OPENCV_FROM_OPENGL = torch.tensor(
-    [1.0, -1.0, -1.0], dtype=torch.float64
-)  # y and z change sign; multiplies columns of camera-to-world rotations
+OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # of the columns of camera-to-world rotations
 
 
 def pose(

@@ -112,7 +112,12 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     names = distinct(file, found, (last_part, without_suffix, str))
     photo = next(filter(None, photos), None)
     spare = image_size(photo) if photo else None  # for frames without w, h and photo
-    parser = None if exported else _dataparser(file.parent / DATAPARSER)
+    parser, beside = None, file.parent / DATAPARSER
+    if not exported and os.path.isfile(beside):
+        about = object_of(read_json(beside), beside, "it", "transform and scale")
+        matrix, scale = about.matrix("transform", 3, 4), about.get("scale", number)
+        about.place.expect(scale > 0, "scale", "above 0", scale)
+        parser = pose(matrix[:, :3], matrix[:, 3], about.place, "transform"), scale
     cameras = [_camera(*each, spare, parser) for each in zip(frames, photos, names, strict=True)]
     cameras, notes = with_lenses(cameras, [_distortion(frame) for frame in frames], options.undistort)
     if exported:
@@ -143,16 +148,6 @@ def _document(file: Path) -> dict[str, Any]:
         rows = row[EXPORTED]
         frames.append({**row, "transform_matrix": [*rows, [0.0, 0.0, 0.0, 1.0]] if isinstance(rows, list) else rows})
     return {"frames": frames}
-
-
-def _dataparser(path: Path) -> Dataparser | None:
-    """Read the file; None if there is none."""
-    if not os.path.isfile(path):
-        return None
-    entry = object_of(read_json(path), path, "it", "transform and scale")
-    matrix, scale = entry.matrix("transform", 3, 4), entry.get("scale", number)
-    entry.place.expect(scale > 0, "scale", "above 0", scale)
-    return pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale
 
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> list[bool] | None:
