@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from torch.autograd.gradcheck import GradcheckError
@@ -38,7 +37,13 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
         UsageError: the module cannot be imported, or there is nothing with laws in it.
     """
     package = module.partition(".")[0]
-    verdicts = list(_left_out(package))
+    left_out = {kind: registry_of(kind).left_out for kind in REGISTRIES} | {"entry point": of_unknown_groups()}
+    verdicts = [
+        Verdict(kind, point.name, "Its entry point registers it.", problem)
+        for kind, points in left_out.items()
+        for point, problem in points.items()
+        if point.module.partition(".")[0] == package
+    ]
     objects = list(_objects(module))
     if not objects and not verdicts:
         problem = f"holds no object that has laws; these are for each {', '.join(LAWS)}"
@@ -58,15 +63,6 @@ def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     return verdicts
 
 
-def _left_out(package: str) -> Iterator[Verdict]:
-    """What entry points of a package name and cannot be used."""
-    left_out = {kind: registry_of(kind).left_out for kind in REGISTRIES}
-    for kind, points in {**left_out, "entry point": of_unknown_groups()}.items():
-        for point, problem in points.items():
-            if point.module.partition(".")[0] == package:
-                yield Verdict(kind, point.name, "Its entry point registers it.", problem)
-
-
 def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
     """Kind, name and value of all that has laws: what entry points of the package name, then the rest of the module.
 
@@ -81,20 +77,17 @@ def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
                 value = point.load()
                 names.add((kind, id(value)))
                 yield kind, point.name, value
-    for name, value in vars(_imported(module)).items():
-        for kind in filter("loss".__ne__, LAWS):  # functions of metrics take the same
-            if not name.startswith("_") and _is_new(kind, value) and (kind, id(value)) not in names:
-                names.add((kind, id(value)))
-                yield kind, getattr(value, "name", name), value
-
-
-def _imported(module: str) -> ModuleType:
     try:
-        return import_module(module)
+        imported = import_module(module)
     except (Exception, SystemExit) as error:  # a plug-in can fail in any way
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         hint = "; give the name that `import` takes, not that of the installed package" if missing else ""
         raise UsageError(f"module {module}", f"cannot be imported: {of_import(error, module)}{hint}") from error
+    for name, value in vars(imported).items():
+        for kind in filter("loss".__ne__, LAWS):  # functions of metrics take the same
+            if not name.startswith("_") and _is_new(kind, value) and (kind, id(value)) not in names:
+                names.add((kind, id(value)))
+                yield kind, getattr(value, "name", name), value
 
 
 def _is_new(kind: str, value: Any) -> bool:

@@ -17,7 +17,7 @@ from aaplug.evaluation.results import Report, results
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
-from aaplug.io.scenes.scene import PART, Scene, SceneFrames
+from aaplug.io.scenes.scene import PART, Scene
 from aaplug.methods.conversion import FORMS, Form, blurring, fuse
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
@@ -104,7 +104,18 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
             job.say_assumed(look)
             fused, report = fit(gaussians, rule, look, job.views, steps, job.monitor)
         elif frames is not None:
-            return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
+            job.say_assumed()
+            look = own_look(job.scene, job.cameras, "auto", options.background, options.cull_margin, options.min_seen)
+            job.check_fit(look)
+            count = 0
+            with job.monitor.progress("converting", "frames") as tell:
+                for done, (frame, target) in enumerate(zip(frames, outputs, strict=True), start=1):
+                    gaussians = frame.gaussians()
+                    training = frames.training_of(gaussians, look.training)
+                    write_scene(target, fuse(gaussians, training, rule), **files)
+                    count += len(gaussians)
+                    tell(done, len(frames))
+            return Converted(count, None, viewer)
         elif path and job.scene.path and job.scene.count > LARGE_SCENE:
             large, train = job.scene, job.cameras.train
             if blurring(large.fused) or large.raw(0, min(1, large.count)).filter_3d is not None:
@@ -128,23 +139,6 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         if path is not None:
             write_scene(path, fused, **files)
     return Converted(len(fused), fused, viewer, report)
-
-
-def _write_frames(
-    job: Job[ConvertOptions], form: Form, frames: SceneFrames, outputs: Sequence[Path], files: Any
-) -> int:
-    """Write the closed form of a scene in time, frame by frame; returns the number of Gaussians."""
-    job.say_assumed()
-    options, count = job.options, 0
-    look = own_look(job.scene, job.cameras, "auto", options.background, options.cull_margin, options.min_seen)
-    job.check_fit(look)
-    with job.monitor.progress("converting", "frames") as tell:
-        for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
-            gaussians = frame.gaussians()
-            write_scene(output, fuse(gaussians, frames.training_of(gaussians, look.training), form), **files)
-            count += len(gaussians)
-            tell(done, len(frames))
-    return count
 
 
 def convert_parts(

@@ -62,20 +62,13 @@ def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view
         Renderer.of(shown, training, recipe, background=WHITE)
         for shown, recipe in ((scene, "classic"), (scene, "auto"), (converted, "mip"))
     ]
-    rows, (left, top, right, bottom) = [], _box(renderers[0](view).alpha)
+    # where the chair is, in pixels of the smallest scale, which are whole at the others
+    places = (renderers[0](view.scaled(min(SCALES))).alpha > 0.5).nonzero()
+    (top, left), (bottom, right) = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
+    rows = list[tuple[float, list[Tensor]]]()
     for scale in SCALES:
-        camera = view.scaled(scale)
+        camera, times = view.scaled(scale), round(scale / min(SCALES))
         images = [resampled(photo, scale), *(renderer(camera).rgb for renderer in renderers)]
-        y = slice(round(top * scale), round(bottom * scale))
-        x = slice(round(left * scale), round(right * scale))
+        y, x = slice(top * times, bottom * times), slice(left * times, right * times)
         rows.append((scale, [image[y, x] for image in images]))
     return contact_sheet(COLUMNS, rows)
-
-
-def _box(alpha: Float[Tensor, "h w"]) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the opaque pixels, on whole pixels of the smallest scale."""
-    rows, columns = (alpha > 0.5).any(dim=1).nonzero(), (alpha > 0.5).any(dim=0).nonzero()
-    step = round(1 / min(SCALES))
-    low = [int(side.min()) // step * step for side in (columns, rows)]
-    high = [-(-(int(side.max()) + 1) // step) * step for side in (columns, rows)]
-    return low[0], low[1], high[0], high[1]

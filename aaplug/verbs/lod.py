@@ -239,7 +239,12 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     there: Iterator[Level] = iter(())
     pyramid = folder if options.viewer is None or options.to else None
     goals = goals_of(options, maker.scene)
-    manifest = pyramid_folder.Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
+    cameras = maker.job.cameras
+    facts = [digest_of_scene(maker.scene), digest_of_cameras(cameras.train), cameras.background] if pyramid else []
+    choices = [options.merge_below, options.tuning, options.views, options.background, options.cull_margin]
+    stream = [] if options.to is None else [options.to, maker.viewer and maker.viewer.name]
+    source = digest_of_values((MERGING_RULE, *facts, *choices, *stream))  # of all that the levels depend on
+    manifest = pyramid_folder.Manifest(source, MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
     if pyramid and options.resume and pyramid_folder.is_pyramid(pyramid):
         earlier = pyramid_folder.read_manifest(pyramid, unfinished=True)
         if earlier.source != manifest.source:
@@ -310,15 +315,6 @@ def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]
     for file in [*files, folder / MANIFEST, *(streamed.facts_file(folder, place) for place in range(len(levels)))]:
         file.unlink(missing_ok=True)
     return levels
-
-
-def _source(maker: _Maker) -> str:
-    """Hash of all that the levels depend on."""
-    cameras, options = maker.job.cameras, maker.job.options
-    facts = [digest_of_scene(maker.scene), digest_of_cameras(cameras.train), cameras.background]
-    choices = [options.merge_below, options.tuning, options.views, options.background, options.cull_margin]
-    streamed = () if options.to is None else (options.to, maker.viewer and maker.viewer.name)
-    return digest_of_values((MERGING_RULE, *facts, *choices, *streamed))
 
 
 def is_made(output: Path, options: LodOptions) -> bool:

@@ -43,12 +43,11 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
 
     with ExitStack() as stack:
         stack.enter_context(running(options))
+        title = None
         if scene is None:
             folder = stack.enter_context(as_file(files("aaplug.io.sample")))
-            scene, cameras = folder / SAMPLE, folder if cameras is None else cameras
-            subject = subject_of(scene, cameras, "the bundled sample", options.words)
-        else:
-            subject = subject_of(scene, cameras, None, options.words)
+            scene, cameras, title = folder / SAMPLE, folder if cameras is None else cameras, "the bundled sample"
+        subject = subject_of(scene, cameras, title, options.words)
         yield stack.enter_context(Server(subject, dropped, options.host, options.port)).address
 
 
