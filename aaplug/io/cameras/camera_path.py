@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
-from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, undivided
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
@@ -46,7 +45,6 @@ class CameraPath:
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training."""
-    refuse_folder(options)
     source = [replace(camera, exposure=None) for camera in path_of(path).cameras]
     sized, _ = at_file_size(source, options)
     cameras = [replace(new, trained_focal=old.trained_focal) for new, old in zip(sized, source, strict=True)]

@@ -85,7 +85,7 @@ class Model:
 def _trained(cameras: Sequence[Camera], run: CfgArgs, options: CameraFileOptions) -> tuple[list[Camera], str]:
     """The cameras at 3DGS's sizes, by its rule, of the photos that training loaded; and why, for a note."""
     if options.train_scale is not None:
-        return sets.at_file_size(cameras, options)
+        return sets.at_train_scale(cameras, options)
     n = run.divisor
     if photographs(cameras):
         loaded, why = sets.photo_sizes(cameras), "size of the photos"

@@ -36,7 +36,16 @@ def sniff(path: Path) -> bool:
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras at the size of their photos, every 8th a test view."""
     file = path / FILE if os.path.isdir(path) else path
-    rows = _rows(file)
+    read_bounded(file, whole_limit("JSON"))
+    try:
+        with warnings.catch_warnings(action="ignore"):  # numpy's, about the file's age
+            rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses more than the file has
+    except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
+        raise FormatError(file, "is not a .npy file of numbers") from error
+    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
+        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {getattr(rows, 'shape', '?')}")
+    if rows.dtype.kind != "f":
+        raise FormatError(file, f"should hold floats, not {rows.dtype}")
     folder = photo_folder(file.parent, options, "images", Place(file, "images"))
     names = [p.name for p in visible(folder.folder) if p.suffix.lower() in SUFFIXES]
     photos = len(names)
@@ -51,20 +60,6 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     trained, why = sets.at_photo_size(source, options)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return sets.camera_set(f"LLFF {FILE}", source, split, why, more=more)
-
-
-def _rows(file: Path) -> np.ndarray:
-    read_bounded(file, whole_limit("JSON"))
-    try:
-        with warnings.catch_warnings(action="ignore"):  # numpy's, about the file's age
-            rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses more than the file has
-    except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
-        raise FormatError(file, "is not a .npy file of numbers") from error
-    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
-        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {getattr(rows, 'shape', '?')}")
-    if rows.dtype.kind != "f":
-        raise FormatError(file, f"should hold floats, not {rows.dtype}")
-    return np.array(rows, np.float64)
 
 
 def _camera(row: np.ndarray, name: str, place: Place) -> Camera:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import WHITE
-from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
+from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, without_suffix
 from aaplug.io.cameras.poses import inverse, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, explicit, undivided
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
@@ -32,7 +32,6 @@ def sniff(path: Path) -> bool:
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of all scales, with the split that the file gives."""
-    refuse_folder(options)
     if options.test_every is not None:
         raise UsageError("test_every", f"{FILE} gives the split; leave it out")
     file = path / FILE if os.path.isdir(path) else path

@@ -83,12 +83,6 @@ def photo_folder(root: Path, options: CameraFileOptions, custom: str, place: Pla
     return PhotoFolder(folder, folder, chosen=True)
 
 
-def refuse_folder(options: CameraFileOptions) -> None:
-    """Refuse a folder of photos, for formats that give each photo's path."""
-    if options.images is not None:
-        raise UsageError("images", "this format gives each photo's path itself; leave it out")
-
-
 def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder) -> list[Camera]:
     """The cameras with their photos, found by the cameras' names."""
     pairs = zip(cameras, places, strict=True)

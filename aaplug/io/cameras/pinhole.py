@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet, numbered
-from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
 from aaplug.io.values import entries, focal, mentions, number, pixels, read_json
@@ -20,7 +19,6 @@ sniff = partial(mentions, keys=["world_to_camera"])
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras; a single one is named after its file, those of a list by their numbers."""
-    refuse_folder(options)
     document = read_json(path)
     alone = isinstance(document, dict)
     items = entries(path, "camera", [document] if alone else document)

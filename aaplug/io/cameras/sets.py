@@ -68,6 +68,13 @@ def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int
 
 
 def at_file_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Camera], str]:
+    """The cameras as `at_train_scale`, of a format that gives each photo's path and so takes no folder of photos."""
+    if options.images is not None:
+        raise UsageError("images", "this format gives each photo's path itself; leave it out")
+    return at_train_scale(cameras, options)
+
+
+def at_train_scale(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Camera], str]:
     """The cameras trained at their size in the file, times `train_scale` if the user chose one; and why, for a note."""
     scale = options.train_scale
     sizes = [_scaled(camera, 1.0 if scale is None else scale) for camera in cameras]
@@ -81,7 +88,7 @@ def at_file_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple
 def at_photo_size(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Camera], str]:
     """The cameras trained at the size of their photos, unless the user chose `train_scale`; and why, for a note."""
     if options.train_scale is not None:
-        return at_file_size(cameras, options)
+        return at_train_scale(cameras, options)
     there, sizes = len(photographs(cameras)), photo_sizes(cameras)
     why = f"size of the {counted(there, 'photo')} found" if there else "size in the file, no photos found"
     return trained_at(cameras, sizes), why + _uncapped(sizes)

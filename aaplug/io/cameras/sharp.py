@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import rigid
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, camera_set, every_nth
 from aaplug.io.ply_header import BIG, TEXT, Header, check_size, read_header
@@ -41,7 +40,6 @@ def has_camera(header: Header) -> bool:
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The camera, named after the file."""
-    refuse_folder(options)
     header = read_header(path)
     check_size(header, path.stat().st_size)
     entry = Entry(Place(path, "its camera"), {})

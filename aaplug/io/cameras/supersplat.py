@@ -14,13 +14,11 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from aaplug.core.cameras import look_at
 from aaplug.io.cameras.camera_path import MAX_ANGLE, CameraPath
 from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, rising, segments
-from aaplug.io.values import Entry, entries, mentions, number, numbers, object_of, read_json
+from aaplug.io.values import entries, mentions, number, object_of, read_json
 from aaplug.system.errors import UsageError
 
 WORLD = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)  # signs of the scene's axes in the viewer's world
@@ -38,8 +36,20 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     [track, *_] = entries(path, "track", about.fields["animTracks"])
     rate, smoothness = track.get("frameRate", number, FPS), track.get("smoothness", number, 0.0)
     track.place.expect(rate > 0, "frameRate", "above 0", rate)
-    frames, (times, values) = track.get("duration", number) * rate, _keys(about, track.entry("keyframes"))
-    times = rising(times * (1 if "frameRate" in track else rate), about.place)  # early files count times in s
+    frames, keys = track.get("duration", number) * rate, track.entry("keyframes")
+    listed, columns = keys.value("times"), keys.entry("values")
+    keys.place.expect(isinstance(listed, list) and len(listed) > 0, "times", "a list of numbers", listed)
+    n = len(listed)
+    angles = torch.full((n,), FOV, dtype=torch.float64)
+    if "fov" in columns:
+        angles = columns.vector("fov", n)
+    elif "camera" in about:
+        angles.fill_(about.entry("camera").get("fov", number, FOV))
+    places = (columns.vector(key, 3 * n).view(n, 3) for key in ("position", "target"))
+    values = torch.cat([*places, angles[:, None]], dim=1)
+    times = rising(
+        keys.vector("times", n) * (1 if "frameRate" in track else rate), about.place
+    )  # early files count times in s
     fps = fps or rate
     at = frame_times(0.0, frames * (fps / rate) - 1, 1.0, about.place) * (rate / fps)
     inside = times < frames
@@ -64,17 +74,3 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
         raise about.place.error(f"position and target: {error}") from error
     focals = max(UNSIZED) / 2 / torch.tan(torch.deg2rad(angles) / 2)
     return CameraPath(cameras_of(torch.linalg.inv(poses), focals, about.place), fps, unsized=True)
-
-
-def _keys(about: Entry, keys: Entry) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 7"]]:
-    """Times of the keys, and their position, target and fov."""
-    times, values = keys.value("times"), keys.entry("values")
-    keys.place.expect(isinstance(times, list) and len(times) > 0, "times", "a list of numbers", times)
-    n = len(times)
-    if "fov" in values:
-        angles = numbers(values.value("fov"), n, values.place, "fov")
-    else:
-        angles = [about.entry("camera").get("fov", number, FOV) if "camera" in about else FOV] * n
-    columns = [values.vector(key, 3 * n).view(n, 3) for key in ("position", "target")]
-    columns.append(torch.tensor(angles, dtype=torch.float64)[:, None])
-    return keys.vector("times", n), torch.cat(columns, dim=1)

@@ -24,7 +24,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.lenses import EQUIRECT, opencv_lens
 from aaplug.io.cameras import sets
-from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, refuse_folder, without_suffix
+from aaplug.io.cameras.photos import MASKED, PhotoFolder, distinct, last_part, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, rigid
 from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import image_size, is_transparent
@@ -96,7 +96,6 @@ def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet
 
 def read_source(file: Path, options: CameraFileOptions) -> Source:
     """The cameras at the size that the file or the photos give, in the frame of the trained scene."""
-    refuse_folder(options)
     document = _document(file)
     shared = {key: value for key, value in document.items() if key != "frames"}
     frames = entries(file, "frame", document["frames"], shared)
