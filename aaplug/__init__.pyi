@@ -26,7 +26,7 @@ from .methods.presets import find_recipe as find_recipe
 from .rendering.renderer import Renderer as Renderer
 
 # the command line's verbs, each as one call
-from .options.shared import Orbit as Orbit
+from .options.verbs import Orbit as Orbit
 from .rendering.assumed import cameras_around as cameras_around
 from .verbs.batch import batch as batch
 from .verbs.bench import bench as bench

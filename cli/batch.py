@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import aaplug
-from aaplug.options.base import DRAWING, as_path, flag
-from aaplug.options.verbs import EvaluateOptions
+from aaplug.options.base import as_path, flag
+from aaplug.options.verbs import DRAWING, EvaluateOptions, RecipeOptions
 from aaplug.system.errors import FormatError, UsageError, did_you_mean
 
 from .console import TERMINAL, quiet
@@ -91,7 +91,6 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], is_made: Callab
     from aaplug.evaluation.report.files import as_json, write_texts
     from aaplug.io.atomic import refuse_existing
     from aaplug.io.scenes.pyramid_folder import is_pyramid
-    from aaplug.options.shared import RecipeOptions
     from aaplug.rendering.job import running
     from aaplug.verbs.batch import SUMMARY, status_table
     from aaplug.verbs.views import file_names

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import aaplug
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
-from aaplug.options.base import CAMERAS, Group, Options, as_path, flag, names, number
-from aaplug.options.shared import SCALE, Orbit
+from aaplug.options.base import Group, Options, as_path, flag, names, number
+from aaplug.options.verbs import CAMERAS, SCALE, Orbit
 from aaplug.system.errors import FormatError, UsageError, counted
 
 from .console import TERMINAL, say

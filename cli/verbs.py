@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import aaplug
 from aaplug.options import verbs
-from aaplug.options.base import REPORT, Options, as_path, flag, names, number
-from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
+from aaplug.options.base import Options, as_path, flag, names, number
+from aaplug.options.verbs import MAX_SIDE, RECIPE_METAVAR, REPORT, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
 from .batch import BATCH, SEVERAL, batch_of_evaluations, for_each_scene, refuse_without_batch

@@ -11,7 +11,7 @@ import aaplug
 from aaplug import CameraSet, Gaussians, Scene, TrainingViews, cameras_around, read_scene, write_png, write_scene
 from aaplug.core.colours import WHITE
 from aaplug.io.photographs import read_photo
-from aaplug.options.shared import Orbit, ViewOptions
+from aaplug.options.verbs import Orbit, ViewOptions
 from aaplug.rendering.agreement import Agreement, agreement, contradictions, settled
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look

@@ -23,7 +23,7 @@ from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.options.base import Options
-from aaplug.options.shared import DEFAULT_FOV, Orbit
+from aaplug.options.verbs import DEFAULT_FOV, Orbit
 from aaplug.rendering.assumed import CROP_SIDE, cameras_around, decibels_at, frame_around, rate_of
 from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Renderer

@@ -15,7 +15,7 @@ from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
-from aaplug.options.shared import FilmOptions
+from aaplug.options.verbs import FilmOptions
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
 from tests.conftest import make_camera, make_scene

@@ -299,7 +299,7 @@ def test_words_of_the_command_line_name_what_is_seen(tmp_path):
     from aaplug_cli.inputs import CameraOptions, SceneOptions
     from aaplug_cli.verbs import VERBS
 
-    from aaplug.options.shared import Orbit
+    from aaplug.options.verbs import Orbit
 
     scene = [str(tmp_path / "s.ply"), "--convention", "mip", "--drop-bad"]
     cameras = ["--cameras", str(tmp_path), "--train-scale", "0.5"]

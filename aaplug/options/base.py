@@ -30,16 +30,6 @@ class Group:
     about: str
 
 
-CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
-ORBIT = Group("orbit", "Views on an orbit around the scene and, without cameras, the training that is assumed.")
-LENS = Group("lens", "The lens to draw through, instead of that of the camera files.")
-FILES = Group("file", "Contents and format of image files.")
-DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
-FILM = Group("film", "Aperture and shutter, for defocus and motion blur.")
-REPORT = Group("report", "Files beside the figures.")
-TUNING = Group("tuning", "The optimization; its defaults were chosen by measurement.")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Argument:
     """How an option is read from words, checked and shown by `--help`.

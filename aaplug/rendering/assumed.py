@@ -23,7 +23,7 @@ from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.ply_tags import NERFSTUDIO
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
-from aaplug.options.shared import DEFAULT_FOV, Orbit, size_of
+from aaplug.options.verbs import DEFAULT_FOV, Orbit, size_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, UsageError

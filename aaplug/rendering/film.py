@@ -8,7 +8,7 @@ import torch
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
 from aaplug.core.lenses import PINHOLE
-from aaplug.options.shared import DEFAULT_SENSOR, FilmOptions
+from aaplug.options.verbs import DEFAULT_SENSOR, FilmOptions
 from aaplug.system.errors import UsageError, counted
 
 SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6

@@ -29,8 +29,7 @@ from aaplug.methods.filters.matched import Matched
 from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import Recipe
 from aaplug.options.base import Options
-from aaplug.options.shared import FrameOptions, Orbit, RecipeOptions, ViewOptions
-from aaplug.options.verbs import ALL, IN_TIME
+from aaplug.options.verbs import ALL, IN_TIME, FrameOptions, Orbit, RecipeOptions, ViewOptions
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.agreement import agreement, contradictions, settled
 from aaplug.rendering.assumed import cameras_around, decibels_at

@@ -11,8 +11,7 @@ from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike
 from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import LevelChoice
-from aaplug.options.shared import size_of
-from aaplug.options.verbs import BenchOptions
+from aaplug.options.verbs import BenchOptions, size_of
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.job import CamerasLike, Job, running

@@ -12,7 +12,7 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.conversion import described_fusions
-from aaplug.options.shared import FrameOptions, Orbit
+from aaplug.options.verbs import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of, up_evidence
 from aaplug.rendering.job import CamerasLike, Job
 from aaplug.rendering.renderer import Renderer

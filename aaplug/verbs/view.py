@@ -9,8 +9,7 @@ from pathlib import Path
 
 from aaplug.io.scenes import SceneLike
 from aaplug.methods import RECIPES
-from aaplug.options.shared import RECIPE_NAMES
-from aaplug.options.verbs import LiveOptions
+from aaplug.options.verbs import RECIPE_NAMES, LiveOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.extras import check_installed
 from aaplug.verbs.verb import looks

@@ -16,8 +16,7 @@ from aaplug.io.atomic import check_output, refuse_existing
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.io.video import CODECS
-from aaplug.options.shared import check_side, size_of
-from aaplug.options.verbs import RenderOptions, VideoOptions
+from aaplug.options.verbs import RenderOptions, VideoOptions, check_side, size_of
 from aaplug.rendering.film import filmed
 from aaplug.rendering.job import Job
 from aaplug.system.errors import OutputError, UsageError, counted
