@@ -197,9 +197,3 @@ def docs_of(options: type) -> dict[str, str]:
 def _checks(options: type[Options]) -> dict[str, Argument]:
     hints = get_type_hints(options, include_extras=True)
     return {name: argument for name, hint in hints.items() if (argument := argument_of(hint)) is not None}
-
-
-def documented(text: str | None, options: type[Options]) -> str:
-    """A verb's docstring with its options, a line each."""
-    lines = [f"    {name}: {doc}" for name, doc in docs_of(options).items()]
-    return "\n".join([inspect.cleandoc(text or ""), "", "Options:", *lines])

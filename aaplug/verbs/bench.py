@@ -8,7 +8,6 @@ from typing import NamedTuple
 from aaplug.core.cameras import Camera
 from aaplug.core.kernels import EAGER
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes import SceneLike
 from aaplug.methods.presets import find_recipe
 from aaplug.methods.recipe import LevelChoice
 from aaplug.options.verbs import BenchOptions, size_of
@@ -17,7 +16,7 @@ from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_cam
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, counted
-from aaplug.verbs.verb import looks
+from aaplug.verbs.verb import SceneLike, looks
 
 TIMED = replace(find_recipe("classic"), levels=LevelChoice())
 DEFAULT_RESOLUTIONS = ("800x800", "1600x1060")

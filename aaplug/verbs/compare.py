@@ -18,7 +18,6 @@ from aaplug.evaluation.report.contact_sheet import sheet_of
 from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, write_page, write_texts
 from aaplug.evaluation.results import as_csv
 from aaplug.evaluation.truth import Truth
-from aaplug.io.atomic import AnyPath
 from aaplug.io.images import write_png
 from aaplug.io.scenes import scene_of
 from aaplug.io.scenes.scene import Scene
@@ -29,7 +28,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.verbs.evaluate import check_journalled
-from aaplug.verbs.verb import ScenesLike, compares
+from aaplug.verbs.verb import AnyPath, ScenesLike, compares
 from aaplug.verbs.views import file_names
 
 SOURCE = "the first scene as its recipe draws it at each size"
@@ -52,7 +51,9 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         AaplugError: as `render`; also, there are fewer than two scenes.
     """
     folder, viewer = None if output is None else Path(output), find_viewer(options.viewer)
-    check = partial(check_compared, folder, options.resume, options.overwrite, options.show)
+    is_shown = options.show != CompareOptions.show
+    how = (folder, (*COMPARED, PAGE), "a comparison", options.resume, options.overwrite)
+    check = partial(check_journalled, *how, show=is_shown)
     check()
     metrics, say = find_metrics(options.metric, PROTOCOL), options.monitor.say
     named = _named(scenes)
@@ -101,12 +102,6 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             for file in [*files, folder / sheet]:
                 say(f"wrote {file}")
     return comparison
-
-
-def check_compared(folder: Path | None, resume: bool, overwrite: bool, show: str) -> None:
-    """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
-    seen = show != CompareOptions.show
-    check_journalled(folder, (*COMPARED, PAGE), "a comparison", resume, overwrite, show=seen)
 
 
 def _named(scenes: ScenesLike) -> dict[str, Scene]:

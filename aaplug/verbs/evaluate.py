@@ -16,12 +16,11 @@ from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.finetuning.poses import refined
 from aaplug.io.atomic import AnyPath, check_name, refuse_existing
-from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, counted
-from aaplug.verbs.verb import RESUME_OR_OVERWRITE, writes
+from aaplug.verbs.verb import RESUME_OR_OVERWRITE, SceneLike, writes
 
 
 @writes(EvaluateOptions)

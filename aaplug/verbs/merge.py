@@ -14,7 +14,6 @@ from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.convolution import fuse_stored
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import placed
-from aaplug.io.atomic import AnyPath
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import check_scene_output, scene_of, write_scene
 from aaplug.io.scenes.columns import check_values
@@ -26,7 +25,7 @@ from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError, counted
-from aaplug.verbs.verb import ScenesLike, compares
+from aaplug.verbs.verb import AnyPath, ScenesLike, compares
 
 TURNS = (3, 4)  # numbers of a turn: degrees about x, y and z, or a quaternion
 

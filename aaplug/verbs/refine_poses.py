@@ -2,11 +2,10 @@
 
 from aaplug.core.cameras import CameraSet
 from aaplug.finetuning.poses import RefinedPose, refined
-from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import PoseOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.errors import UsageError
-from aaplug.verbs.verb import looks
+from aaplug.verbs.verb import SceneLike, looks
 
 
 @looks(PoseOptions)

@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
-from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path, select_views
-from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import counted, one
-from aaplug.verbs.verb import writes
+from aaplug.verbs.verb import AnyPath, SceneLike, writes
 from aaplug.verbs.views import drawn, image_paths, names_image, storage_of
 
 

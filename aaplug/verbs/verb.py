@@ -15,7 +15,7 @@ import torch
 
 from aaplug.io.atomic import AnyPath, check_name
 from aaplug.io.scenes import SceneLike
-from aaplug.options.base import Options, documented
+from aaplug.options.base import Options, docs_of
 from aaplug.rendering.job import CamerasLike, detached
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError, did_you_mean
@@ -109,6 +109,7 @@ def _verb(options: Any, body: Callable[..., Any]) -> Any:
     hints = get_type_hints(options)  # without what the command line adds to them
     fields = [p.replace(annotation=hints[name]) for name, p in inspect.signature(options).parameters.items()]
     signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
-    verb.__doc__ = documented(body.__doc__, options)
+    told = [f"    {name}: {doc}" for name, doc in docs_of(options).items()]
+    verb.__doc__ = "\n".join([inspect.cleandoc(body.__doc__ or ""), "", "Options:", *told])
     vars(verb).update(__signature__=signature, options=options)
     return verb

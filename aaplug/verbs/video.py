@@ -15,12 +15,10 @@ from torch import Tensor
 from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
-from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_image
-from aaplug.io.scenes import SceneLike
 from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
 from aaplug.rendering.frames import write_frames
@@ -30,7 +28,7 @@ from aaplug.system.errors import UsageError, counted, listing
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.frame_sequences import FrameSequence
-from aaplug.verbs.verb import writes
+from aaplug.verbs.verb import AnyPath, SceneLike, writes
 from aaplug.verbs.views import drawn, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says

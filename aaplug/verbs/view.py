@@ -7,12 +7,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from aaplug.io.scenes import SceneLike
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import RECIPE_NAMES, LiveOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.extras import check_installed
-from aaplug.verbs.verb import looks
+from aaplug.verbs.verb import SceneLike, looks
 
 SAMPLE = "chair.ply"
 WAIT_SECONDS = 3600.0  # at once, for the interrupt that ends a view
