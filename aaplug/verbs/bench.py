@@ -1,11 +1,9 @@
 """How fast this machine renders, stage by stage."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
-from aaplug.core.cameras import Camera
 from aaplug.core.kernels import EAGER
 from aaplug.io.limits import lack_of_memory
 from aaplug.methods.presets import find_recipe
@@ -40,10 +38,17 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
     """
     if scene is not None and tuple(options.gaussians) != BenchOptions.gaussians:
         raise UsageError("gaussians", "are of synthetic scenes; leave them out, or the scene")
-    runs: list[Figures] = []
+    runs, exponents = list[Figures](), dict[str, float]()
     with running(options):
-        if scene is None:
-            work = _synthetic(options)
+        if scene is None:  # every scene at the first size, and the middle one at the others
+            usual = DEFAULT_RESOLUTIONS if len(options.gaussians) > 1 else DEFAULT_RESOLUTIONS[:1]
+            first, *others = [synthetic_camera(*size_of(text)).as_trained() for text in options.resolution or usual]
+            most = max(options.gaussians)
+            if lacking := lack_of_memory(GAUSSIAN_BYTES * most):
+                raise UsageError("gaussians", f"{most:,} with gradients take {lacking}")
+            scenes = [Renderer.of(synthetic_scene(n), [first], TIMED, rasterizer="eager") for n in options.gaussians]
+            middle = scenes[len(scenes) // 2]
+            work = [*((each, first) for each in scenes), *((middle, camera) for camera in others)]
         else:
             job = Job.of(scene, cameras, options)
             job.scene.gaussians()  # with harmonics, which the renderer else leaves in a large file
@@ -63,30 +68,13 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
             shape = f"{counted(run.gaussians, 'Gaussian')}, {run.width}x{run.height}"
             options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
-    return Bench(runs, _exponents(runs))
-
-
-def _synthetic(options: BenchOptions) -> list[tuple[Renderer, Camera]]:
-    """Every scene at the first size, and the middle one at the others."""
-    given = options.resolution or (DEFAULT_RESOLUTIONS if len(options.gaussians) > 1 else DEFAULT_RESOLUTIONS[:1])
-    first, *others = [synthetic_camera(*size_of(text)).as_trained() for text in given]
-    most = max(options.gaussians)
-    if lacking := lack_of_memory(GAUSSIAN_BYTES * most):
-        raise UsageError("gaussians", f"{most:,} with gradients take {lacking}")
-    scenes = [Renderer.of(synthetic_scene(n), [first], TIMED, rasterizer="eager") for n in options.gaussians]
-    middle = scenes[len(scenes) // 2]
-    return [*((scene, first) for scene in scenes), *((middle, camera) for camera in others)]
-
-
-def _exponents(runs: Sequence[Figures]) -> dict[str, float]:
-    """How forward time grows with Gaussians at one size, and with pixels for one scene."""
-    found: dict[str, float] = {}
     for name in dict.fromkeys(run.rasterizer for run in runs):
         own = [run for run in runs if run.rasterizer == name]
-        sized = [r for r in own if (r.width, r.height) == (own[0].width, own[0].height)]
-        alike = [r for r in own if r.gaussians == own[-1].gaussians]
-        counts, pixels = [float(r.gaussians) for r in sized], [float(r.width * r.height) for r in alike]
-        for what, runs_of, sizes in (("Gaussians", sized, counts), ("pixels", alike, pixels)):
-            if len(sizes) > 1:
-                found[f"{name}: {what}"] = exponent(sizes, [r.forward_ms for r in runs_of])
-    return found
+        sized = [
+            (float(r.gaussians), r.forward_ms) for r in own if (r.width, r.height) == (own[0].width, own[0].height)
+        ]
+        alike = [(float(r.width * r.height), r.forward_ms) for r in own if r.gaussians == own[-1].gaussians]
+        for what, points in (("Gaussians", sized), ("pixels", alike)):
+            if len(points) > 1:
+                exponents[f"{name}: {what}"] = exponent(*map(list, zip(*points, strict=True)))
+    return Bench(runs, exponents)

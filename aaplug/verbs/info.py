@@ -93,27 +93,23 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
             "below_a_pixel_share": {str(size): share for size, share in shares.items() if share is not None},
         }
     elif train:
-        facts |= _sampling_facts(opened, statistics, job.cameras)
+        rate, multiple = statistics.rates.quantile(0.5), statistics.multiples.quantile(0.5)
+        kernel, some = opened.convention.kernel, opened.sample(SPECTRUM_ROWS)
+        above = dict[str, dict[str, float | None]]()
+        for name in SPECTRUM_RECIPES:
+            renderer = Renderer.of(some, TrainingViews.of(some, train), name)
+            shares = {f"at {scale_name(scale)}": above_nyquist(renderer, train, scale) for scale in SPECTRUM_SCALES}
+            above |= {} if None in shares.values() else {name: shares}
+        facts |= {
+            "training_cameras": len(train),
+            "seen_share": statistics.seen / max(1, statistics.count),
+            "median_rate_px_per_unit": None if rate is None else math.exp(rate),
+            "under_sampling_bound_share": statistics.under / max(1, statistics.seen),
+            "aliasing_begins_at_scale": None if multiple is None else aliasing_begins(math.exp(multiple), kernel),
+            "cameras": list(job.cameras.notes),
+            "energy_above_nyquist_share": above,
+        }
     return facts | {"problems": list(_problems(opened, statistics))}
-
-
-def _sampling_facts(scene: Scene, statistics: Survey, cameras: CameraSet) -> dict[str, Any]:
-    rate, multiple = statistics.rates.quantile(0.5), statistics.multiples.quantile(0.5)
-    begins = None if multiple is None else aliasing_begins(math.exp(multiple), scene.convention.kernel)
-    train, above = cameras.train, dict[str, dict[str, float | None]]()
-    some = scene.sample(SPECTRUM_ROWS)
-    for name in SPECTRUM_RECIPES:
-        renderer = Renderer.of(some, TrainingViews.of(some, train), name)
-        above[name] = {f"at {scale_name(scale)}": above_nyquist(renderer, train, scale) for scale in SPECTRUM_SCALES}
-    return {
-        "training_cameras": len(train),
-        "seen_share": statistics.seen / max(1, statistics.count),
-        "median_rate_px_per_unit": None if rate is None else math.exp(rate),
-        "under_sampling_bound_share": statistics.under / max(1, statistics.seen),
-        "aliasing_begins_at_scale": begins,
-        "cameras": list(cameras.notes),
-        "energy_above_nyquist_share": {n: found for n, found in above.items() if None not in found.values()},
-    }
 
 
 def _problems(scene: Scene, statistics: Survey) -> Iterator[str]:

@@ -207,16 +207,11 @@ def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
         motion = tuple(_parsed(float, field, place) for field in fields[1:8])
         name = text(fields[-1].strip(), place, "name")
         yield Image(place, name, _parsed(int, fields[8], place), motion[:4], motion[4:])
-        if points := next(lines, None):  # of the image, an empty line if there are none
-            _check_points(Place(file, f"line {points[0]}"), points[1])
-
-
-def _check_points(place: Place, line: bytes) -> None:
-    """Refuse what is no line of points, so that no image is taken for one; only as many fields as an image's count."""
-    fields = line.split(maxsplit=IMAGE_FIELDS)
-    whole = len(fields) > IMAGE_FIELDS or len(fields) % 3 == 0
-    right = whole and all(map(NUMBER.fullmatch, fields[:IMAGE_FIELDS]))
-    place.expect(right, "it", "the points of the image above, X Y POINT3D_ID each, or empty", line)
+        row, points = next(lines, (row, b""))  # of the image, an empty line if there are none
+        several = points.split(maxsplit=IMAGE_FIELDS)  # of as many as an image has it is seen that they are points
+        whole = len(several) > IMAGE_FIELDS or len(several) % 3 == 0
+        right, what = whole and all(map(NUMBER.fullmatch, several[:IMAGE_FIELDS])), "X Y POINT3D_ID each, or empty"
+        Place(file, f"line {row}").expect(right, "it", f"the points of the image above, {what}", points)
 
 
 def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
