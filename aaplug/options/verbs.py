@@ -1,7 +1,4 @@
-"""Options of each verb: first the classes that several share, then one for each.
-
-Their names, ranges and defaults stand here once.
-"""
+"""Options of each verb: first the classes that several share, then one for each."""
 
 import math
 import os

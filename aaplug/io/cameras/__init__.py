@@ -69,7 +69,6 @@ class CameraFormat(Protocol):
         ...
 
 
-# the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria.Model(), colmap, blender, inria, multiscale, transforms, llff, sharp)
 PATH_FORMATS = (camera_path, supersplat, lichtfeld, gltf, usd)

@@ -10,10 +10,9 @@ import os
 import re
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from aaplug.core.lenses import EQUIRECT, Lens, opencv_lens
 from aaplug.io.lenses import PANORAMA
@@ -38,8 +37,7 @@ NUMBER = re.compile(rb"[-+.\deE]+")
 IMAGE_FIELDS = 10  # id, 4 of the quaternion, 3 of the translation, camera id, name
 
 
-@dataclass(frozen=True)
-class Model:
+class Model(NamedTuple):
     """One of COLMAP's camera models.
 
     parameters: how many.
@@ -84,8 +82,7 @@ MODELS = (  # by COLMAP's model id
 MODEL_NAMES = {model.name: model for model in MODELS}
 
 
-@dataclass(frozen=True)
-class Intrinsics:
+class Intrinsics(NamedTuple):
     """A camera as its file has it; values are checked when an image uses it."""
 
     place: Place
@@ -96,8 +93,7 @@ class Intrinsics:
     parameters: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Image:
+class Image(NamedTuple):
     """An image as its file has it."""
 
     place: Place

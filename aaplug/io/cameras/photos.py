@@ -100,11 +100,10 @@ def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
     files = [path, *photos]
     for folder in (home, home / "sparse", home / "sparse" / "0", home / "0"):
         files += [file for file in visible(folder) if CAMERA_FILE.fullmatch(file.name)]
-    photo_folders = {photo.parent for photo in photos}
-    for folder, names in product(photo_folders, PHOTO_FOLDERS):
-        beside = visible(folder.parent) if names.fullmatch(folder.name) else []
-        for each in filter(lambda path: names.fullmatch(path.name), beside):
-            files += [file for file in visible(each) if file.suffix.lower() in SUFFIXES]
+    for folder, names in product({photo.parent for photo in photos}, PHOTO_FOLDERS):
+        for each in visible(folder.parent) if names.fullmatch(folder.name) else ():
+            if names.fullmatch(each.name):
+                files += [file for file in visible(each) if file.suffix.lower() in SUFFIXES]
     return tuple(dict.fromkeys(files))
 
 
