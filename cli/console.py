@@ -108,8 +108,7 @@ def refuse(problem: str) -> None:
 class Terminal(Monitor):
     """Prints messages and progress on stderr: a bar on a terminal, a line now and then elsewhere."""
 
-    def __init__(self) -> None:
-        self._workers = ""
+    _workers = ""  # that share the work, in words
 
     def working(self, workers: int) -> None:
         """Tell it with the progress."""

@@ -16,7 +16,6 @@ from typing import Annotated, Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import (
-    blender,
     camera_path,
     colmap,
     gltf,
@@ -70,7 +69,7 @@ class CameraFormat(Protocol):
 
 
 OWN: tuple[CameraFormat, ...]
-OWN = (pinhole, camera_path, inria.Model(), colmap, blender, inria, multiscale, transforms, llff, sharp)
+OWN = (pinhole, camera_path, inria.Model(), colmap, transforms.Blender(), inria, multiscale, transforms, llff, sharp)
 PATH_FORMATS = (camera_path, supersplat, lichtfeld, gltf, usd)
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 

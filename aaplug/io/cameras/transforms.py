@@ -13,7 +13,7 @@ have fl_x, w and h.
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -30,9 +30,10 @@ from aaplug.io.cameras.sets import CameraFileOptions, Size
 from aaplug.io.images import image_size, is_transparent
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
 from aaplug.io.values import Entry, Place, entries, focal, mentions, number, object_of, pixels, read_json, text
-from aaplug.system.errors import FormatError
+from aaplug.system.errors import FormatError, UsageError
 
 FILE = "transforms.json"
+TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
 STEREO = ("OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # if the coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
@@ -51,15 +52,6 @@ name = "transforms"
 sign = "transforms.json (nerfstudio, instant-ngp)"
 
 
-@dataclass(frozen=True)
-class Source:
-    """The cameras of a file.  held_out: true for each that is a test view, None if the file does not say."""
-
-    cameras: tuple[Camera, ...]
-    held_out: Sequence[bool] | None = None
-    notes: tuple[str, ...] = ()
-
-
 def sniff(path: Path) -> bool:
     """True for a folder that holds transforms.json, and for a file that is one by its name or keys."""
     if os.path.isdir(path):
@@ -70,32 +62,59 @@ def sniff(path: Path) -> bool:
 
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of one file."""
-    file = path / FILE if os.path.isdir(path) else path
-    source = read_source(file, options)
-    return set_of(source, options, f"lists in {file.name}" if source.held_out else f"only {file.name} read")
+    return _set([path / FILE if os.path.isdir(path) else path], options)
 
 
-def set_of(source: Source, options: CameraFileOptions, reason: str) -> CameraSet:
-    """The set of the source's cameras; photos with alpha mean a white background, Blender's custom.
+class Blender:
+    """A Blender (NeRF-synthetic) dataset: a folder with `transforms_train.json` and `transforms_test.json`."""
 
-    reason: of the split that the source has, or of none.
+    name = "blender"
+    sign = "transforms_train.json (Blender)"
+
+    @staticmethod
+    def sniff(path: Path) -> bool:
+        """True for a folder with training views."""
+        return os.path.isfile(path / TRAIN)
+
+    @staticmethod
+    def read(path: Path, options: CameraFileOptions) -> CameraSet:
+        """The cameras, with the split that the files give."""
+        files = [path / TRAIN, *filter(os.path.isfile, [path / TEST])]
+        if len(files) > 1 and options.test_every is not None:
+            raise UsageError("test_every", f"{path / TEST} gives the split; leave it out")
+        cameras = _set(files, options)
+        more = (f"{VAL} is not read",) if os.path.isfile(path / VAL) else ()
+        return replace(cameras, notes=cameras.notes + more)
+
+
+def _set(files: Sequence[Path], options: CameraFileOptions) -> CameraSet:
+    """The cameras of one file, or of one with training and one with test views.
+
+    Photos with alpha mean a white background, Blender's custom.
     """
-    cameras, why = sets.at_file_size(source.cameras, options)
-    if source.held_out is not None and options.test_every is None:
-        pairs = list(zip(cameras, source.held_out, strict=True))
-        train, test = ([camera for camera, out in pairs if out == held] for held in (False, True))
-        split = sets.explicit(train, test, reason)
+    (source, held_out, notes), *test = (_source(file, options) for file in files)
+    reason = f"lists in {files[0].name}" if held_out else f"only {files[0].name} read"
+    for more, _, others in test:
+        held_out, reason = [False] * len(source) + [True] * len(more), f"{TRAIN} and {TEST}"
+        source, notes = [*source, *more], list(dict.fromkeys(notes + others))
+    cameras, why = sets.at_file_size(source, options)
+    if held_out is not None and options.test_every is None:
+        pairs = list(zip(cameras, held_out, strict=True))
+        train, held = ([camera for camera, out in pairs if out == is_held] for is_held in (False, True))
+        split = sets.explicit(train, held, reason)
     else:
         cameras = sorted(cameras, key=lambda camera: camera.name) if options.test_every else cameras
         split = sets.every_nth(cameras, options, 0, reason)
-    alpha = any(is_transparent(camera.photo) for camera in source.cameras if camera.photo)
+    alpha = any(is_transparent(camera.photo) for camera in source if camera.photo)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
-    background = WHITE if alpha else None
-    return sets.camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
+    return sets.camera_set("transforms JSON", source, split, why, WHITE if alpha else None, [*more, *notes])
 
 
-def read_source(file: Path, options: CameraFileOptions) -> Source:
-    """The cameras at the size that the file or the photos give, in the frame of the trained scene."""
+def _source(file: Path, options: CameraFileOptions) -> tuple[list[Camera], list[bool] | None, list[str]]:
+    """The cameras at the size that the file or the photos give, in the frame of the trained scene; and notes.
+
+    Between them: true for each that is a test view, None if the file does not say.
+    """
     document = _document(file)
     shared = {key: value for key, value in document.items() if key != "frames"}
     frames = entries(file, "frame", document["frames"], shared)
@@ -127,7 +146,7 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
         notes.append(f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it")
     if any(MASK in frame for frame in frames):
         notes.append(MASKED)
-    return Source(tuple(cameras), _held_out(file, document, paths), tuple(notes))
+    return cameras, _held_out(file, document, paths), notes
 
 
 def _document(file: Path) -> dict[str, Any]:
