@@ -5,7 +5,6 @@ both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre o
 lengths and principal points are in px.  A camera keeps its lens, as far as `core.lenses` has it.  Points are not read.
 """
 
-import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
+from aaplug.io.cameras.keyframes import unit
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import pose
 from aaplug.io.cameras.sets import CameraFileOptions
@@ -24,7 +24,6 @@ from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
 SPLIT_LISTS = ("train_list.txt", "test_list.txt", "test.txt")  # nerfbaselines' and 3DGS's
-MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
 
 name = "colmap"
 sign = "sparse/0 or sparse (COLMAP)"
@@ -91,10 +90,8 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
         cx, cy = values[n : n + 2]
     width, height = pixels(lens.width, lens.place, "width"), pixels(lens.height, lens.place, "height")
     translation = [number(value, image.place, "translation") for value in image.translation]
-    length = math.hypot(*image.quaternion)
-    usable = MIN_QUATERNION_LENGTH <= length < math.inf
-    image.place.expect(usable, "quaternion", "finite and not zero", image.quaternion)
-    turn = rotation_matrices(torch.tensor([image.quaternion], dtype=torch.float64) / length)[0]
+    quats = unit(torch.tensor([image.quaternion], dtype=torch.float64), image.place, "quaternion")
+    turn = rotation_matrices(quats)[0]
     cam_from_world = pose(turn, torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 

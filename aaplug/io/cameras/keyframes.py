@@ -64,11 +64,11 @@ def slerp(first: Float[Tensor, "f 4"], last: Float[Tensor, "f 4"], share: Float[
     return torch.from_numpy((start * Rotation.from_rotvec(share[:, None].numpy() * way)).as_quat())
 
 
-def unit(quats: Float[Tensor, "n 4"], place: Place) -> Float[Tensor, "n 4"]:
+def unit(quats: Float[Tensor, "n 4"], place: Place, field: str = "rotation") -> Float[Tensor, "n 4"]:
     """Quaternions of length 1."""
     lengths = quats.norm(dim=1, keepdim=True)
     wrong = ~((lengths > MIN_LENGTH) & lengths.isfinite())[:, 0]  # squares of large numbers are infinite
-    place.expect(not wrong.any(), "rotation", "a length above 0 and finite", quats.tolist()[int(wrong.int().argmax())])
+    place.expect(not wrong.any(), field, "finite and not zero", quats.tolist()[int(wrong.int().argmax())])
     return quats / lengths
 
 
