@@ -86,7 +86,15 @@ class Batch:
         if not self.whole:
             return [scenes]
         if self.protocol is not None:
-            return [*map(paper_table, self.papers()), scenes]
+            printed = list[Table | str]()
+            for paper in self.papers():
+                table = Table(title=escape(paper.title), title_justify="left")
+                for i, heading in enumerate(paper.headings):
+                    table.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
+                for row in paper.rows:
+                    table.add_row(*(Text(cell.replace(" ±", "\n±")) for cell in row))
+                printed.append(table)
+            return [*printed, scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), list[Table | str]()
         over = f"mean of {counted(len(self.reports), 'scene')}"
         for metric in first.metrics:
@@ -94,16 +102,6 @@ class Batch:
             lines = [[metric.text(value) for value in line] for line in values]
             grids += metric_grid(f"{metric.title}, {over}", [*self.reports.values()], metric, lines)
         return [*grids, scenes]
-
-
-def paper_table(paper: Paper) -> Table:
-    """The table in print."""
-    table = Table(title=escape(paper.title), title_justify="left")
-    for i, heading in enumerate(paper.headings):
-        table.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-    for row in paper.rows:
-        table.add_row(*(Text(cell.replace(" ±", "\n±")) for cell in row))
-    return table
 
 
 def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:

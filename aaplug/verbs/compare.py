@@ -5,9 +5,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
-
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
 from aaplug.evaluation.engine import Task, evaluate, facts_of
@@ -98,7 +95,12 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             files = write_texts(folder, texts, replaces)
             title = f"{rows[0].name} and {', '.join(scene.name for scene in rows[1:])}"
             files += write_page(title, report, bounds, images, replaces, comparison.facts())
-            write_png(folder / sheet, _sheet(comparison, task), overwrite=replaces)
+            others = dict([*task.renderers.items()][1:])
+            psnr = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe in others]
+            lowest = min(((value, view) for value, view in psnr if value is not None), default=None)
+            worst = report.protocol["view_names"].index(lowest[1]) if lowest else 0
+            how = (sorted(scales, reverse=True), others, rows[0].name)
+            write_png(folder / sheet, sheet_of(truth, views[worst], *how, errors=True), overwrite=replaces)
             for file in [*files, folder / sheet]:
                 say(f"wrote {file}")
     return comparison
@@ -116,13 +118,3 @@ def _named(scenes: ScenesLike) -> dict[str, Scene]:
     longer = [f"{s.file.parent.name}/{name}" if s.file else name for name, s in zip(titles, opened, strict=True)]
     names = longer if len(set(titles)) < len(set(longer)) == len(longer) else titles
     return dict(zip(file_names(names, "scene", 1), opened, strict=True))
-
-
-def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
-    """The view with the lowest PSNR at every scale: the truth, then every other scene and the map of its errors."""
-    reference, report = comparison.reference.name, comparison.report
-    values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
-    defined = [(value, view) for value, view in values if value is not None]
-    worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
-    others = {name: renderer for name, renderer in task.renderers.items() if name != reference}
-    return sheet_of(task.truth, task.views[worst], sorted(task.scales, reverse=True), others, reference, errors=True)

@@ -52,7 +52,15 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     if photos != len(rows):
         names = [f"{i:03}" for i in range(len(rows))]
     places = [Place(file, f"row {i}") for i in range(len(rows))]
-    source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
+    source = list[Camera]()
+    for row, name, place in zip(rows, names, places, strict=True):
+        values = [number(float(value), place, "it") for value in row]
+        matrix = torch.tensor(values[:15], dtype=torch.float64).reshape(3, 5)
+        height, width = (pixels(matrix[i, 4].item(), place, field) for i, field in enumerate(("height", "width")))
+        f = focal(matrix[2, 4].item(), place, "focal length")
+        down, right, back = matrix[:, :3].unbind(dim=1)
+        world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
+        source.append(centred(name, (width, height), f, inverse(world_from_cam)))
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
     uneven = f"photos: {folder.folder.name} holds {photos} and the file {len(rows)} poses, so none is used"
@@ -60,13 +68,3 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     trained, why = sets.at_photo_size(source, options)
     split = sets.every_nth(trained, options, sets.LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return sets.camera_set(f"LLFF {FILE}", source, split, why, more=more)
-
-
-def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
-    values = [number(float(value), place, "it") for value in row]
-    matrix = torch.tensor(values[:15], dtype=torch.float64).reshape(3, 5)
-    height, width = (pixels(matrix[i, 4].item(), place, field) for i, field in enumerate(("height", "width")))
-    f = focal(matrix[2, 4].item(), place, "focal length")
-    down, right, back = matrix[:, :3].unbind(dim=1)
-    world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
-    return centred(name, (width, height), f, inverse(world_from_cam))
