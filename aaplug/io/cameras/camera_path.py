@@ -14,7 +14,7 @@ from pathlib import Path
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, undivided
-from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
+from aaplug.io.values import entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError, counted
 
 KEY = "camera_path"
@@ -65,29 +65,27 @@ def path_of(path: Path, _: float | None = None) -> CameraPath:
     frames = entries(path, "frame", about.fields[KEY])
     shutter = about.get("shutter", number) if about.fields.get("shutter") is not None else None
     about.place.expect(shutter is None or 0 < shutter <= 1, "shutter", "above 0, at most 1", shutter)
-    named = zip(frames, numbered(len(frames)), strict=True)
-    return CameraPath(tuple(_camera(entry, name, size) for entry, name in named), fps, shutter)
-
-
-def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
-    angle = entry.get("fov", number)
-    entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
-    f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
-    motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-    turn, centre = motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3]
-    cam_from_world = inverse(pose(turn, centre, entry.place, "camera_to_world"))
-    exact = {
-        field: entry.get(key, number if key in ("cx", "cy") else focal)
-        for key, field in EXACT.items()
-        if entry.fields.get(key) is not None
-    }
-    exposure = None
-    if entry.fields.get("aperture") is not None:
-        about = entry.entry("aperture")
-        radius, focus = about.get("radius", number), about.get("focus", number)
-        blades = about.get("blades", number, 0.0)
-        try:
-            exposure = Exposure(Aperture(radius, focus, int(blades)))
-        except UsageError as error:
-            raise entry.place.error(f"aperture: {error}") from error
-    return replace(centred(name, size, f, cam_from_world), **exact, exposure=exposure)
+    cameras = list[Camera]()
+    for entry, name in zip(frames, numbered(len(frames)), strict=True):
+        angle = entry.get("fov", number)
+        entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
+        f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
+        motion = entry.vector("camera_to_world", 16).reshape(4, 4)
+        turn, centre = motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3]
+        cam_from_world = inverse(pose(turn, centre, entry.place, "camera_to_world"))
+        exact = {
+            field: entry.get(key, number if key in ("cx", "cy") else focal)
+            for key, field in EXACT.items()
+            if entry.fields.get(key) is not None
+        }
+        exposure = None
+        if entry.fields.get("aperture") is not None:
+            aperture = entry.entry("aperture")
+            radius, focus = aperture.get("radius", number), aperture.get("focus", number)
+            blades = aperture.get("blades", number, 0.0)
+            try:
+                exposure = Exposure(Aperture(radius, focus, int(blades)))
+            except UsageError as error:
+                raise entry.place.error(f"aperture: {error}") from error
+        cameras.append(replace(centred(name, size, f, cam_from_world), **exact, exposure=exposure))
+    return CameraPath(tuple(cameras), fps, shutter)

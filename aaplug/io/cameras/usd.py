@@ -33,37 +33,33 @@ def sniff(path: Path) -> bool:
 def path_of(path: Path, fps: float | None = None) -> CameraPath:
     """The camera at each frame, or at rest as a path of one; fps: how many a second, None for the stage's own."""
     check_installed("pxr", "usd", "path", f"{path.suffix} files need the extra `usd`")
+    Usd, UsdGeom = module("Usd"), module("UsdGeom")
     try:
-        return _read(path, fps)
+        _check_layers(path)
+        stage = Usd.Stage.Open(str(path))
+        found = [UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+        if not found:
+            raise FormatError(path, "holds no camera")
+        camera = next(filter(_moves, found), found[0])
+        place = Place(path, f"camera {camera.GetPath()}")
+        times, moving = [Usd.TimeCode.EarliestTime()], _moves(camera)
+        codes = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
+        authored = stage.HasAuthoredMetadata("framesPerSecond")
+        rate = number(stage.GetFramesPerSecond(), place, "framesPerSecond") if authored else codes
+        place.expect(codes > 0 and rate > 0, "frames and time codes per second", "above 0", [rate, codes])
+        fps = fps or rate
+        if stage.HasAuthoredTimeCodeRange() and moving:
+            first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
+            place.expect(first <= last, "time codes", "rising", [first, last])
+            times = list(map(Usd.TimeCode, frame_times(first, last, fps / codes, place).tolist()))
+        elif moving:
+            raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
+        named = zip(numbered(len(times)), times, strict=True)
+        cameras, shutters = zip(*(_camera(name, camera, time, place) for name, time in named), strict=True)
+        shutter = shutters[0] * rate / codes
+        return CameraPath(cameras, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
     except (module("Tf").ErrorException, UnicodeDecodeError) as error:  # its message may be no text
         raise FormatError(path, "cannot be read: it breaks the format of USD") from error
-
-
-def _read(path: Path, fps: float | None) -> CameraPath:
-    Usd, UsdGeom = module("Usd"), module("UsdGeom")
-    _check_layers(path)
-    stage = Usd.Stage.Open(str(path))
-    found = [UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    if not found:
-        raise FormatError(path, "holds no camera")
-    camera = next(filter(_moves, found), found[0])
-    place = Place(path, f"camera {camera.GetPath()}")
-    times, moving = [Usd.TimeCode.EarliestTime()], _moves(camera)
-    codes = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
-    authored = stage.HasAuthoredMetadata("framesPerSecond")
-    rate = number(stage.GetFramesPerSecond(), place, "framesPerSecond") if authored else codes
-    place.expect(codes > 0 and rate > 0, "frames and time codes per second", "above 0", [rate, codes])
-    fps = fps or rate
-    if stage.HasAuthoredTimeCodeRange() and moving:
-        first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
-        place.expect(first <= last, "time codes", "rising", [first, last])
-        times = list(map(Usd.TimeCode, frame_times(first, last, fps / codes, place).tolist()))
-    elif moving:
-        raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
-    named = zip(numbered(len(times)), times, strict=True)
-    cameras, shutters = zip(*(_camera(name, camera, time, place) for name, time in named), strict=True)
-    shutter = shutters[0] * rate / codes
-    return CameraPath(cameras, fps, shutter if 0 < shutter <= 1 else None, unsized=True)
 
 
 def module(name: str) -> Any:
