@@ -20,7 +20,7 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.conventions import CLASSIC, KHR
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
-from aaplug.io.cameras.cfg_args import read_cfg_args
+from aaplug.io.cameras.inria import read_cfg_args
 from aaplug.io.cameras.photos import without_suffix
 from aaplug.io.cameras.poses import inverse
 from aaplug.io.cameras.sets import CameraFileOptions

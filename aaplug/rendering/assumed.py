@@ -17,7 +17,8 @@ from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of
 from aaplug.core.orbits import orbit as orbit_views
 from aaplug.core.sampling import sampling_bounds
 from aaplug.io.cameras import recognized
-from aaplug.io.cameras.cfg_args import CAPPED, DIVISORS, NAME, WIDTH_CAP, read_cfg_args
+from aaplug.io.cameras.inria import CAPPED, CFG_ARGS, DIVISORS, read_cfg_args
+from aaplug.io.cameras.sets import WIDTH_CAP
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.ply_tags import NERFSTUDIO
@@ -102,7 +103,7 @@ def _assumed_training(
     if orbit.train_view is not None:
         size, reason = size_of(orbit.train_view, "train_view"), "--train-view"
     elif width := _width_in_run(path):
-        size, reason = (width, round(width * TRAIN_VIEW[1] / TRAIN_VIEW[0])), f"width from {NAME}"
+        size, reason = (width, round(width * TRAIN_VIEW[1] / TRAIN_VIEW[0])), f"width from {CFG_ARGS}"
     fov = math.radians(DEFAULT_FOV)
     rings = [orbit_views(frame, ORBIT_VIEWS, size, math.radians(e), fov, f"training_{e:.0f}") for e in RINGS]
     views = tuple(view.as_trained() for ring in rings for view in ring)
@@ -169,7 +170,7 @@ def _width_in_run(path: Path | None) -> int | None:
         return None
     for folder in (path.parent, *path.absolute().parents[2:3]):
         try:
-            resolution = read_cfg_args(folder / NAME).resolution
+            resolution = read_cfg_args(folder / CFG_ARGS).resolution
         except AaplugError:  # there is none, or it is of another program
             continue
         return None if resolution in (CAPPED, *DIVISORS) else int(resolution)

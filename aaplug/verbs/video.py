@@ -27,9 +27,8 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, counted, listing
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
-from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import AnyPath, SceneLike, writes
-from aaplug.verbs.views import drawn, storage_of
+from aaplug.verbs.views import FrameSequence, drawn, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
-from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import FormatError, UsageError, counted
 
 LLFF_HOLD = 8  # every 8th view by name is a test view: LLFF, 3DGS --eval
+WIDTH_CAP = 1600  # px: 3DGS, utils/camera_utils.py
 MAX_ASPECT_ERROR = 0.01  # relative difference between a photo's aspect and its camera's that rounding explains
 
 Size = tuple[int, int]
