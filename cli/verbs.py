@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import aaplug
 from aaplug.options import verbs
 from aaplug.options.base import Options, as_path, flag, names, number
-from aaplug.options.verbs import MAX_SIDE, RECIPE_METAVAR, REPORT, FrameOptions, Orbit
+from aaplug.options.verbs import MAX_SIDE, RECIPE_METAVAR, RECIPE_NAMES, REPORT, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
 from .batch import BATCH, SEVERAL, batch_of_evaluations, for_each_scene, refuse_without_batch
@@ -490,11 +490,9 @@ def recipes(words: Words) -> Answer:
     is about that of classic, or not known.  To measure recipes on a scene, use evaluate.
     """
     from aaplug.methods import RECIPES
-    from aaplug.system.registry import names_of
 
-    used = names_of("recipe", comparisons=False)
     facts = [
-        {"name": r.name, "source": r.source, "cost": r.cost, "when": r.when, "comparison": r.name not in used}
+        {"name": r.name, "source": r.source, "cost": r.cost, "when": r.when, "comparison": r.name not in RECIPE_NAMES}
         for r in RECIPES.values()
     ]
     headings = ("--recipe", "cost", "when to use it", "what it is, and whose")

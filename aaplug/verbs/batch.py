@@ -139,14 +139,14 @@ def batch(
     Raises:
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
-    found = None
+    output, found = Path(output), None
     if protocol is not None:
         data_set_of(protocol)  # refuses what has none
         found = PROTOCOLS[protocol]
-    folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
+    folders = [output / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
 
     def check() -> None:
-        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS, TABLE)], overwrite, resume)
+        refuse_existing([output / name for name in (SUMMARY, RESULTS, TABLE)], overwrite, resume)
         for folder in folders:
             check_results(folder, resume, overwrite)
 
@@ -164,28 +164,23 @@ def batch(
                 monitor.say(f"failed: {name}: {report}")
         names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
         done = Batch(names, reports, failures, found, partly)
-        if resume and not reports and (Path(output) / SUMMARY).exists():
-            monitor.say(f"no scene finished: {Path(output) / SUMMARY} and what is beside it stay as they were")
+        if resume and not reports and (output / SUMMARY).exists():
+            monitor.say(f"no scene finished: {output / SUMMARY} and what is beside it stay as they were")
             return done
-        if overwrite:
-            _remove_rest(Path(output), names)
+        if overwrite:  # what an earlier batch wrote beyond these scenes, as its summary tells, is removed
+            with suppress(OSError, ValueError, LookupError, TypeError):  # no summary, or a damaged one
+                scenes = json.loads((output / SUMMARY).read_bytes())["scenes"]
+                for journal in output.glob(f"*/{JOURNAL}"):
+                    if journal.parent.name in scenes and journal.parent.name not in names:
+                        remove_run(journal.parent)
+                refuse_inputs([output / TABLE])
+                (output / TABLE).unlink(missing_ok=True)
         texts = {SUMMARY: as_json(done.summary()), RESULTS: as_csv(reports)}
         if papers := done.papers():
             texts[TABLE] = "\n".join(paper.as_latex() for paper in papers)
         for path in write_texts(output, texts, overwrite=True):  # checked at the start
             monitor.say(f"wrote {path}")
     return done
-
-
-def _remove_rest(output: Path, names: Mapping[str, str]) -> None:
-    """Remove what an earlier batch wrote beyond the scenes of these names, as its summary tells."""
-    with suppress(OSError, ValueError, LookupError, TypeError):  # no summary, or a damaged one
-        scenes = json.loads((output / SUMMARY).read_bytes())["scenes"]
-        for journal in output.glob(f"*/{JOURNAL}"):
-            if journal.parent.name in scenes and journal.parent.name not in names:
-                remove_run(journal.parent)
-        refuse_inputs([output / TABLE])
-        (output / TABLE).unlink(missing_ok=True)
 
 
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
