@@ -189,10 +189,13 @@ def evaluate(words: Words) -> Answer:
 
     if is_set(str(words.protocol), path) or words.models is not None or words.skip:
         return batch_of_evaluations(words, of_set=True)
+    from aaplug.evaluation.results import results, tables
+    from aaplug.verbs.evaluate import check_results
+
+    # before the scene is read
+    check_results(words.output, words.resume, words.overwrite, words.report, words.layout)
     inputs = read_inputs(words)
     report = aaplug.evaluate(*inputs, words.output, **told(words, verbs.EvaluateOptions))
-    from aaplug.evaluation.results import results, tables
-
     return Answer(results(report), tables(report))
 
 
@@ -244,6 +247,9 @@ def compare(words: Words) -> Answer:
         raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
     if words.fail_under is not None and "psnr" not in map(str.lower, words.metric):
         raise UsageError("fail_under", "is of PSNR, which `metric` leaves out")
+    from aaplug.verbs.compare import check_compared
+
+    check_compared(words.output, words.resume, words.overwrite, words.show)  # before anything is read
     scenes = [open_scene(words, path) for path in paths]
     cameras = read_cameras(words, scenes[0])
     comparison = aaplug.compare(scenes, cameras, words.output, **told(words, verbs.CompareOptions))

@@ -65,6 +65,14 @@ def test_a_folder_that_cannot_be_looked_into(cli, words):
     cli.refused(f"{words} scene.ply --cameras . -o loop", " loop: cannot be written: too many levels of symbolic links")
 
 
+@pytest.mark.parametrize("words", ["evaluate", "compare scene.ply"])
+def test_a_folder_of_results_is_refused_before_anything_is_read(cli, words):
+    Path("out").mkdir()
+    Path("out/progress.jsonl").touch()
+    code, _, err = cli(f"{words} scene.ply --cameras . -o out")
+    assert (code, err.count("\n"), "--overwrite starts anew" in err) == (2, 1, True)
+
+
 def test_names_that_are_not_utf_8(cli, plots_drawn_once):
     odd = os.fsdecode(b"\xff\xfe")
     Path("scene.ply").rename(f"{odd}.ply")

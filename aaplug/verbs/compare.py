@@ -48,9 +48,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         AaplugError: as `render`; also, there are fewer than two scenes.
     """
     folder, viewer = None if output is None else Path(output), find_viewer(options.viewer)
-    is_shown = options.show != CompareOptions.show
-    how = (folder, (*COMPARED, PAGE), "a comparison", options.resume, options.overwrite)
-    check = partial(check_journalled, *how, show=is_shown)
+    check = partial(check_compared, folder, options.resume, options.overwrite, options.show)
     check()
     metrics, say = find_metrics(options.metric, PROTOCOL), options.monitor.say
     named = _named(scenes)
@@ -104,6 +102,12 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             for file in [*files, folder / sheet]:
                 say(f"wrote {file}")
     return comparison
+
+
+def check_compared(folder: Path | None, resume: bool, overwrite: bool, show: str) -> None:
+    """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
+    seen = show != CompareOptions.show
+    check_journalled(folder, (*COMPARED, PAGE), "a comparison", resume, overwrite, show=seen)
 
 
 def _named(scenes: ScenesLike) -> dict[str, Scene]:
