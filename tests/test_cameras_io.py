@@ -5,8 +5,10 @@ import json
 import math
 import os
 import struct
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.conventions import CLASSIC, KHR
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
-from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
+from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.inria import read_cfg_args
 from aaplug.io.cameras.photos import without_suffix
 from aaplug.io.cameras.poses import inverse
@@ -28,7 +30,7 @@ from aaplug.io.scenes import write_scene
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera, make_scene
-from tests.scene_files import write_json
+from tests.scene_files import with_value, write_json
 from tests.test_camera_paths import document
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
@@ -82,6 +84,10 @@ def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
     assert camera.centre.tolist() == [1, 2, 3]
     assert values(camera) == (300, 310, 200, 100)
     assert (camera.name, camera.hw, camera.trained_focal) == ("a", (200, 400), camera.focal)
+    rough = [[0.0, -1.0002, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.9999]]
+    (camera,) = read_cameras(inria(tmp_path, inria_entry("y" * 5000, rotation=rough))).train
+    turn = camera.cam_from_world[:3, :3]
+    assert torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-15), "made orthonormal"
 
 
 @pytest.mark.parametrize(
@@ -155,20 +161,7 @@ def test_cfg_args_is_never_run(tmp_path):
     with pytest.raises(FormatError, match="eval should be a literal"):
         read_cameras(inria(tmp_path, cfg=f"Namespace(resolution=1, eval=open({str(trap)!r}, 'w'))"))
     assert not trap.exists()
-
-
-@pytest.mark.parametrize(
-    "cfg",
-    [
-        *("1", "print(1)", "Namespace(1)", "Namespace(**{'resolution': 1})", "Namespace(x=1); import os"),
-        *("Namespace(resolution=0)", "Namespace(resolution='4')", "Namespace(eval=1)", "Namespace(x=f'{1}')"),
-        *("Namespace(images='../secret')", f"Namespace(x={'-' * 5000}1)", f"Namespace(x='{'y' * 70000}')"),
-    ],
-    ids=range(12),
-)
-def test_odd_cfg_args_are_refused_and_those_of_windows_read_without_warnings(tmp_path, cfg):
-    refused(inria(tmp_path, cfg=cfg))
-    (tmp_path / "cfg_args").write_text(r"Namespace(source_path='D:\data\scene', resolution=2)")
+    (tmp_path / "cfg_args").write_text(r"Namespace(source_path='D:\data\scene', resolution=2)")  # of Windows
     assert read_cfg_args(tmp_path / "cfg_args").resolution == 2
 
 
@@ -181,53 +174,13 @@ def test_where_training_had_its_photos_is_told_and_not_read(tmp_path):
     assert (found.train[0].photo is not None, note in found.notes) == (True, False)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"fx": 0}, "camera 1: fx should be from 1e-06 to 1e+09 px, not 0"),
-        ({"fx": True}, "camera 1: fx should be a number, not True"),
-        ({"fx": 10**400}, "camera 1: fx should be a finite number"),
-        ({"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
-        ({"position": [1, 2]}, "camera 1: position should be 3 numbers"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation should be 3 rows of 3 numbers"),
-        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "R·Rᵀ is 3 off the identity"),
-        ({"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "it mirrors"),
-        ({"img_name": "../a"}, "path '../a' should stay within the dataset"),
-        ({"img_name": "C:\\a"}, "should stay within the dataset"),
-        ({"img_name": "\ud800"}, "img_name should be printable text"),
-        ({"img_name": "y" * 5000}, None),
-    ],
-    ids=str,
-)
-def test_inria_names_what_is_wrong(tmp_path, change, message):
-    folder = inria(tmp_path, inria_entry(), inria_entry("b") | change)
-    if message is None:  # odd, but allowed
-        read_cameras(folder)
-    else:
-        refused(folder, "cameras.json", message)
-
-
 def test_the_inverse_of_a_pose_does_not_depend_on_its_layout_in_memory():
     pose = make_camera((1.3, -4.1, 0.7)).cam_from_world
     pose[:3, 3] = torch.tensor([1.3, -4.1, 0.7])
     assert inverse(pose).equal(inverse(pose.T.contiguous().T))
 
 
-def test_rotation_is_made_orthonormal(tmp_path):
-    rough = [[0.0, -1.0002, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.9999]]
-    (camera,) = read_cameras(inria(tmp_path, inria_entry(rotation=rough))).train
-    r = camera.cam_from_world[:3, :3]
-    assert torch.allclose(r @ r.T, torch.eye(3, dtype=torch.float64), atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "{}", "[]", "[1]", "[" * 100_000, '[{"id": Infinity}]', '[{"width": ' + "9" * 5000 + "}]", "\xff"],
-    ids=range(8),
-)
-def test_odd_json_is_refused(tmp_path, text, monkeypatch):
-    (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
-    refused(tmp_path)
+def test_longer_json_than_the_limit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("AAPLUG_JSON", "100")
     refused(inria(tmp_path), "longer than 100 bytes")
 
@@ -289,9 +242,8 @@ def one_camera(model, values):
 def test_colmap_values(tmp_path, write):
     write(tmp_path / "sparse" / "0")
     first, second = read_cameras(tmp_path, test_every=0).train
-    assert (first.name, second.name) == ("a.b", "cam b/with space")
-    assert values(first) == (250, 250, 200, 100)
-    assert values(second) == (300, 310, 199, 101)
+    assert (first.name, *values(first)) == ("a.b", 250, 250, 200, 100)
+    assert (second.name, *values(second)) == ("cam b/with space", 300, 310, 199, 101)
     turned = torch.tensor([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], dtype=torch.float64)
     assert torch.allclose(second.cam_from_world, turned, atol=1e-15)
     assert first.cam_from_world[:3, 3].tolist() == [0, 0.5, 0.25]
@@ -385,33 +337,11 @@ def test_a_panorama_is_taken_as_it_is(tmp_path, kind):
         read_cameras(tmp_path, undistort=True)
 
 
-def test_a_colmap_panorama_has_a_size(tmp_path):
-    colmap_txt(tmp_path, *one_camera(1, (300.0, 310.0, 200.0, 100.0)))
-    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 0 200\n")
-    refused(tmp_path, "parameter should be")
-
-
 def test_colmap_models_have_their_number_of_parameters(tmp_path):
     """The cameras that follow are read only if each one's parameters were all read and no more."""
     counts = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
     first = [(10 + model, model, 400, 200, (1.0,) * count) for model, count in enumerate(counts)]
     assert len(read_cameras(colmap_bin(tmp_path, (*first, *CAMERAS))).all) == 2
-
-
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        ((1, (0.0, 0, 0, 0), (0.0, 0, 0), 1, "a"), "image 1: quaternion should be finite"),
-        ((1, (1.0, 0, 0, 0), (math.inf, 0, 0), 1, "a"), "translation should be a finite number"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 9, "a"), "uses camera 9"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "../a"), "should stay within the dataset"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "a\nb"), "name should be printable"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "n" * 5000), "should end within 4096 bytes"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_colmap_names_what_is_wrong(tmp_path, image, message):
-    refused(colmap_bin(tmp_path, images=(image,)), message)
 
 
 def test_colmap_cut_anywhere_is_refused(tmp_path):
@@ -479,10 +409,8 @@ def test_blender_values(tmp_path):
     cameras = read_cameras(blender(tmp_path))
     assert (names(cameras.train), names(cameras.test)) == (["r_0", "r_1", "r_2"], ["r_0", "r_1"])
     camera = cameras.train[0]
-    assert (camera.width, camera.height, camera.cx, camera.cy) == (40, 20, 20, 10)
-    assert camera.fx == camera.fy == pytest.approx(20)  # 90° over 40 px
-    assert camera.photo == tmp_path / "train" / "r_0.png"
-    assert cameras.train[1].photo is None
+    assert (camera.hw, values(camera)) == ((20, 40), pytest.approx((20, 20, 20, 10)))  # 90° over 40 px
+    assert (camera.photo, cameras.train[1].photo) == (tmp_path / "train" / "r_0.png", None)
     assert cameras.background == WHITE
     assert camera.centre.tolist() == [1, 2, 3]
     # the camera looks along its own -z, so along the world's -z; its up is -x of the world
@@ -519,9 +447,8 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
     frames = [{"file_path": "a/1.png"}, {"file_path": "b/1.png", "fl_x": 50, "w": 60}]
     path = write_json(tmp_path / "transforms.json", transforms(frames, **shared))
     first, second = read_cameras(tmp_path).train
-    assert (first.name, second.name) == ("a/1", "b/1")
-    assert (first.fx, first.fy, first.cx, first.cy, first.hw) == (30, 31, 19, 9, (20, 40))
-    assert (second.fx, second.fy, second.hw) == (50, 31, (20, 60))
+    assert (first.name, *values(first), first.hw) == ("a/1", 30, 31, 19, 9, (20, 40))
+    assert (second.name, second.fx, second.fy, second.hw) == ("b/1", 50, 31, (20, 60))
     assert read_cameras(path, test_every=2).test[0].name == "a/1"
     photo(tmp_path / "b" / "1.png", 60, 20)
     twice = transforms([{"file_path": "b/1.png"}, {"file_path": "./b/1"}], **shared)
@@ -587,25 +514,6 @@ def test_what_is_not_read_beside_the_cameras_is_told(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("frame", "message"),
-    [
-        ({"k1": "a"}, "frame 0: k1 should be a number"),
-        ({"distortion_params": 3}, "distortion_params should be a list"),
-        ({"camera_model": "VR180_L"}, "camera_model is VR180_L, which has no focal length"),
-        ({"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
-        ({"file_path": "../x"}, "should stay within the dataset"),
-        ({"transform_matrix": OPENGL[:3]}, "transform_matrix should be 4 rows of 4 numbers"),
-        ({"transform_matrix": [*OPENGL[:3], [0, 0, 0, 2]]}, "last row should be 0 0 0 1"),
-    ],
-    ids=str,
-)
-def test_transforms_name_what_is_wrong(tmp_path, frame, message):
-    refused(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}])), "add w and h")
-    document = transforms([{"file_path": "a"} | frame], w=40, h=20)
-    refused(write_json(tmp_path / "transforms.json", document), message)
-
-
-@pytest.mark.parametrize(
     ("lens", "name", "coefficients"),
     [
         ({"k1": -0.1, "p2": 0.01, "camera_model": "OPENCV"}, "OPENCV", (-0.1, 0, 0, 0.01, 0)),
@@ -660,45 +568,19 @@ def test_an_exported_list_is_in_the_trained_frame(tmp_path):
         assert "ns-export cameras" in cameras.notes[-1]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"fl_x": None}, "give nerfstudio's transforms.json"),
-        ({"transform": None}, "item 0 should be an object with file_path and transform"),
-        ({"transform": 3}, "transform_matrix should be"),
-        ({"file_path": None}, "file_path is missing"),
-    ],
-    ids=str,
-)
-def test_an_exported_list_names_what_it_lacks(tmp_path, change, message):
-    entry = {k: v for k, v in (EXPORTED | change).items() if v is not None}
-    with pytest.raises(FormatError, match=message):
-        read_cameras(write_json(tmp_path / "transforms_train.json", [entry]))
-
-
 def test_nerfstudios_lists_are_the_split(tmp_path):
     frames = [{"file_path": f"{c}.png"} for c in "abc"]
-    lists = {"train_filenames": ["a.png", "c.png"], "test_filenames": ["b.png"]}
-    path = write_json(tmp_path / "transforms.json", transforms(frames, w=40, h=20, **lists))
-    cameras = read_cameras(path)
-    assert (names(cameras.train), names(cameras.test)) == (["a", "c"], ["b"])
-    assert len(read_cameras(path, test_every=0).train) == 3
-    for changed, train, test in [
+    for lists, train, test in [
+        ({"train_filenames": ["a.png", "c.png"], "test_filenames": ["b.png"]}, ["a", "c"], ["b"]),
         ({"train_filenames": ["./a.png", ".\\c.png"]}, ["a", "c"], ["b"]),
         ({"train_filenames": ["a.png"], "test_filenames": []}, ["a"], ["b", "c"]),
         ({"test_filenames": ["b.png"]}, ["a", "c"], ["b"]),
+        ({"test_frames": [{"transform_matrix": OPENGL, "file_path": "d.png"}]}, ["a", "b", "c"], ["d"]),  # ScanNet++
     ]:
-        cameras = read_cameras(write_json(path, transforms(frames, w=40, h=20, **changed)))
+        path = write_json(tmp_path / "transforms.json", transforms(frames, w=40, h=20, **lists))
+        cameras = read_cameras(path)
         assert (names(cameras.train), names(cameras.test)) == (train, test)
-    more = {"test_frames": [{"transform_matrix": OPENGL, "file_path": "d.png"}]}  # ScanNet++
-    cameras = read_cameras(write_json(path, transforms(frames, w=40, h=20, **more)))
-    assert (names(cameras.train), names(cameras.test)) == (["a", "b", "c"], ["d"])
-    write_json(path, transforms(frames, w=40, h=20, test_frames=[{"file_path": "d.png"}]))
-    refused(path, "test frame 0: transform_matrix is missing")
-    write_json(path, transforms(frames, w=40, h=20, **lists | {"train_filenames": "a.png"}))
-    refused(path, "train_filenames should be a list")
-    write_json(path, transforms(frames, w=40, h=20, val_filenames=["b.jpg"]))
-    refused(path, "val_filenames should be paths of frames, not 'b.jpg'")
+        assert "test_frames" in lists or len(read_cameras(path, test_every=0).train) == 3
 
 
 def test_the_dataparsers_transform_takes_poses_to_the_trained_frame(tmp_path):
@@ -732,8 +614,7 @@ def pinhole(**changes):
 def test_pinhole_values(tmp_path):
     (camera,) = read_cameras(write_json(tmp_path / "cam_40.json", pinhole())).train
     assert camera.cam_from_world.tolist() == pinhole()["world_to_camera"]
-    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.hw) == (30, 31, 19, 9, (20, 40))
-    assert camera.name == "cam_40"
+    assert (camera.name, *values(camera), camera.hw) == ("cam_40", 30, 31, 19, 9, (20, 40))
     views = read_cameras(write_json(tmp_path / "list.json", [pinhole()] * 11), test_every=5)
     assert names(views.test) == ["camera_00", "camera_05", "camera_10"]
 
@@ -808,17 +689,6 @@ def test_multiscale_blender_has_a_view_a_scale(tmp_path):
         read_cameras(tmp_path, test_every=8)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("file_path", ["../x", "y"]), ("cam2world", None), ("width", []), ("height", [1]), ("focal", [1e999, 1])],
-    ids=str,
-)
-def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
-    document = json.loads(multiscale(tmp_path).read_text())
-    document["train"][key] = value
-    refused(write_json(tmp_path / "metadata.json", document), "metadata.json")
-
-
 # SHARP -----------------------------------------------------------------------------------------
 
 
@@ -845,21 +715,6 @@ def test_the_camera_of_a_sharp_file_is_that_of_its_photograph(tmp_path, order):
     assert (scene.convention, scene.cameras) == (KHR, read_cameras(path))
     aaplug.write_scene(tmp_path / "again.ply", scene.gaussians())
     assert aaplug.read_scene(tmp_path / "again.ply").cameras is not None
-
-
-@pytest.mark.parametrize(
-    ("table", "column", "message"),
-    [
-        ("intrinsic", [300, 1, 21, 0, 310, 14, 0, 0, 1], "its camera: intrinsic should be [[fx 0 cx]"),
-        ("intrinsic", [-3, 0, 21, 0, 310, 14, 0, 0, 1], "intrinsic should be from 1e-06"),
-        ("intrinsic", [300, 0, math.nan, 0, 310, 14, 0, 0, 1], "intrinsic should be a finite number, not nan"),
-        ("image_size", [0, 30], "image_size should be a whole number of px"),
-        ("extrinsic", [2.0, *TURNED[1:]], "extrinsic should be a rotation"),
-        ("extrinsic", [*TURNED[:15], 2.0], "extrinsic's last row should be 0 0 0 1"),
-    ],
-)
-def test_an_odd_camera_of_a_sharp_file_is_refused(tmp_path, table, column, message):
-    refused(sharp(tmp_path, **{table: column}), "photo.ply: its camera", message)
 
 
 def test_tables_of_another_kind_are_no_camera(tmp_path):
@@ -942,7 +797,95 @@ def test_each_format_is_recognized_and_no_other_takes_its_files(tmp_path, name):
     path = FIXTURES[name][0](tmp_path / "set") if name != "inria" else inria(tmp_path / "set")
     takers = [format.name for format in OWN if format.sniff(path)]
     assert takers == ([name, "inria"] if name == "inria_model" else [name])
-    assert read_cameras(path).all
+    cameras = read_cameras(str(path))
+    assert cameras.all
+    assert name != "camera_path" or cameras.notes[0].startswith("camera path: 1 free camera, ")
+
+
+def write_text(path, text):
+    path.write_text(text, encoding="latin-1")
+    return path
+
+
+def write_transforms(folder, frame, **shared):
+    return write_json(folder / "transforms.json", transforms([{"file_path": "a"} | frame], **shared))
+
+
+def write_multiscale(path, change):
+    return write_json(path, with_value(json.loads(path.read_text()), ("train", change[0]), change[1]))
+
+
+SPOIL = {  # how to make a file of cameras with something changed
+    "cfg_args": lambda folder, text: inria(folder, cfg=text),
+    "text": lambda folder, text: write_text(folder / "cameras.json", text),
+    "inria": lambda folder, change: inria(folder, inria_entry(), inria_entry("b") | change),
+    "cameras.txt": lambda folder, text: write_text(colmap_txt(folder) / "cameras.txt", text).parent,
+    "image": lambda folder, image: colmap_bin(folder, images=(image,)),
+    "frame": lambda folder, change: write_transforms(folder, change, w=40, h=20),
+    "transforms": lambda folder, shared: write_transforms(folder, {}, **shared),
+    "exported": lambda folder, entry: write_json(folder / "transforms_train.json", [entry]),
+    "multiscale": lambda folder, change: write_multiscale(multiscale(folder), change),
+    "sharp": lambda folder, tables: sharp(folder, **tables),
+}
+AT = (0.0, 0.0, 0.0)
+UNTURNED = (1.0, 0.0, 0.0, 0.0)
+CFG_ARGS = [
+    *("1", "print(1)", "Namespace(1)", "Namespace(**{'resolution': 1})", "Namespace(x=1); import os"),
+    *("Namespace(resolution=0)", "Namespace(resolution='4')", "Namespace(eval=1)", "Namespace(x=f'{1}')"),
+    *("Namespace(images='../secret')", f"Namespace(x={'-' * 5000}1)", f"Namespace(x='{'y' * 70000}')"),
+]
+TEXTS = ["", "{}", "[]", "[1]", "[" * 100_000, '[{"id": Infinity}]', '[{"width": ' + "9" * 5000 + "}]", "\xff"]
+MULTISCALE = [("file_path", ["../x", "y"]), ("cam2world", None), ("width", []), ("height", [1]), ("focal", [1e999, 1])]
+SIDES = {"w": 40, "h": 20}
+WRONG = [
+    *(("cfg_args", text, "cfg_args") for text in CFG_ARGS),
+    *(("text", text, "cameras") for text in TEXTS),
+    ("inria", {"fx": 0}, "cameras.json: camera 1: fx should be from 1e-06 to 1e+09 px, not 0"),
+    ("inria", {"fx": True}, "camera 1: fx should be a number, not True"),
+    ("inria", {"fx": 10**400}, "camera 1: fx should be a finite number"),
+    ("inria", {"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
+    ("inria", {"position": [1, 2]}, "camera 1: position should be 3 numbers"),
+    ("inria", {"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation should be 3 rows of 3 numbers"),
+    ("inria", {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "R·Rᵀ is 3 off the identity"),
+    ("inria", {"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "it mirrors"),
+    ("inria", {"img_name": "../a"}, "path '../a' should stay within the dataset"),
+    ("inria", {"img_name": "C:\\a"}, "should stay within the dataset"),
+    ("inria", {"img_name": "\ud800"}, "img_name should be printable text"),
+    ("cameras.txt", "1 EQUIRECTANGULAR 400 200 0 200\n7 EQUIRECTANGULAR 400 200 0 200", "parameter should be"),
+    ("image", (1, (0.0, 0, 0, 0), AT, 1, "a"), "image 1: quaternion should be finite"),
+    ("image", (1, UNTURNED, (math.inf, 0, 0), 1, "a"), "translation should be a finite number"),
+    ("image", (1, UNTURNED, AT, 9, "a"), "uses camera 9"),
+    ("image", (1, UNTURNED, AT, 1, "../a"), "should stay within the dataset"),
+    ("image", (1, UNTURNED, AT, 1, "a\nb"), "name should be printable"),
+    ("image", (1, UNTURNED, AT, 1, "n" * 5000), "should end within 4096 bytes"),
+    ("transforms", {}, "add w and h"),
+    ("frame", {"k1": "a"}, "frame 0: k1 should be a number"),
+    ("frame", {"distortion_params": 3}, "distortion_params should be a list"),
+    ("frame", {"camera_model": "VR180_L"}, "camera_model is VR180_L, which has no focal length"),
+    ("frame", {"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
+    ("frame", {"file_path": "../x"}, "should stay within the dataset"),
+    ("frame", {"transform_matrix": OPENGL[:3]}, "transform_matrix should be 4 rows of 4 numbers"),
+    ("frame", {"transform_matrix": [*OPENGL[:3], [0, 0, 0, 2]]}, "last row should be 0 0 0 1"),
+    ("transforms", SIDES | {"test_frames": [{"file_path": "d.png"}]}, "test frame 0: transform_matrix is missing"),
+    ("transforms", SIDES | {"train_filenames": "a.png"}, "train_filenames should be a list"),
+    ("transforms", SIDES | {"val_filenames": ["b.jpg"]}, "val_filenames should be paths of frames, not 'b.jpg'"),
+    ("exported", {key: EXPORTED[key] for key in EXPORTED if key != "fl_x"}, "give nerfstudio's transforms.json"),
+    ("exported", {"file_path": "a.png"}, "item 0 should be an object with file_path and transform"),
+    ("exported", EXPORTED | {"transform": 3}, "transform_matrix should be"),
+    ("exported", {key: EXPORTED[key] for key in EXPORTED if key != "file_path"}, "file_path is missing"),
+    *(("multiscale", change, "metadata.json") for change in MULTISCALE),
+    ("sharp", {"intrinsic": [300, 1, 21, 0, 310, 14, 0, 0, 1]}, "intrinsic should be [[fx 0 cx]"),
+    ("sharp", {"intrinsic": [-3, 0, 21, 0, 310, 14, 0, 0, 1]}, "photo.ply: its camera: intrinsic should be from 1e-06"),
+    ("sharp", {"intrinsic": [300, 0, math.nan, 0, 310, 14, 0, 0, 1]}, "intrinsic should be a finite number, not nan"),
+    ("sharp", {"image_size": [0, 30]}, "its camera: image_size should be a whole number of px"),
+    ("sharp", {"extrinsic": [2.0, *TURNED[1:]]}, "its camera: extrinsic should be a rotation"),
+    ("sharp", {"extrinsic": [*TURNED[:15], 2.0]}, "its camera: extrinsic's last row should be 0 0 0 1"),
+]
+
+
+@pytest.mark.parametrize(("kind", "change", "message"), WRONG, ids=range(len(WRONG)))
+def test_a_file_of_cameras_names_what_is_wrong(tmp_path, kind, change, message):
+    refused(SPOIL[kind](tmp_path, change), message)
 
 
 @dataclass(frozen=True)
@@ -951,12 +894,14 @@ class Dialect:
 
     name: str = "dialect"
     sign: str = "a dialect"
+    change: Mapping[str, Any] = field(default_factory=dict)
 
     def sniff(self, path: Path) -> bool:
         return path.name == "transforms.json"
 
     def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
-        return CameraSet((make_camera(),), (), notes=("by the plug-in",))
+        cameras = (replace(make_camera(), **self.change),)
+        return CameraSet(cameras, cameras, notes=("by the plug-in",))
 
 
 def with_formats(monkeypatch, *formats):
@@ -987,20 +932,8 @@ FAR_AWAY[0, 3] = 1e300
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message):
-    class Careless(Dialect):
-        def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
-            cameras = (replace(make_camera(), **change),)
-            return CameraSet(cameras, cameras)
-
-    with_formats(monkeypatch, Careless())
-    with pytest.raises(FormatError, match=message):
-        read_cameras(write_json(tmp_path / "transforms.json", {}))
-
-
-def test_a_path_is_text_too(tmp_path):
-    assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
-    assert len(read_camera_path(str(write_json(tmp_path / "path.json", document()))).cameras) == 1
-    assert read_cameras(tmp_path / "path.json").notes[0].startswith("camera path: 1 free camera, ")
+    with_formats(monkeypatch, Dialect(change=change))
+    refused(write_json(tmp_path / "transforms.json", {}), message)
 
 
 # Real scenes ------------------------------------------------------------------------------------
