@@ -74,9 +74,9 @@ def test_reading_a_written_png_gives_the_quantised_image(tmp_path: Path, bit_dep
     path, rgb = str(tmp_path / "a.png"), random_image() * 1.4 - 0.2
     aaplug.write_png(path, rgb, bit_depth)
     written = levels(rgb, bit_depth) / (2**bit_depth - 1)
-    for read in (aaplug.read_image(path), read_photo(path, WHITE)):
-        assert torch.equal(read, written)
-    assert bit_depth == 16 or torch.equal(read_rgba(path)[..., :3], written)
+    assert torch.equal(aaplug.read_image(path), written)
+    for eight_bits in (read_photo(path, WHITE), read_rgba(path)[..., :3]):
+        assert bit_depth == 16 or torch.equal(eight_bits, written)
     assert image_size(path) == (7, 5)
     codes = torch.arange(2**bit_depth).reshape(-1, 256, 1).expand(-1, -1, 3)
     rgb = codes.float() / (2**bit_depth - 1)
