@@ -93,6 +93,7 @@ VIDEO = "video scene.ply --cameras . -o new.webm"
 BARE = "render scene.ply -o new"
 EVALUATE = "evaluate scene.ply --cameras . -o new"
 LOD = "lod scene.ply"
+COMPARE = "compare scene.ply scene.ply --cameras . --metric psnr"
 TUNE = "finetune scene.ply --cameras . -o new.ply --rasterizer eager"
 REFUSED = {
     "convert scene.ply --cameras . -o ./scene.ply --overwrite": ["scene.ply", "input"],
@@ -108,6 +109,13 @@ REFUSED = {
     "render --cameras . -o new": ["error: SCENE: name one scene"],
     "render gone.ply --cameras . -o new": ["gone.ply"],
     "render gone.ply -o new --background nocolour": ["--background: takes auto or an opaque colour as CSS writes it"],
+    "compare scene.ply --cameras .": ["compare: needs two scenes or more, got 1"],
+    "compare --cameras .": ["compare: needs two scenes or more, got 0"],
+    "compare scene.ply gone.ply --cameras .": ["gone.ply: cannot be read: no such file"],
+    f"{COMPARE} --fail-under 40db": ["--fail-under: takes 0..200"],
+    f"{COMPARE} --resume": ["--resume: needs a folder"],
+    f"{COMPARE} --show 2": ["--show: needs a folder"],
+    f"{COMPARE} --views nothing": ["there is no view 'nothing'"],
     "compare gone.ply b.ply --background transparent": ["; for none, render and video have `transparent`"],
     "render gone.ply -o new --background transparent": ["--background: takes", "video have --transparent"],
     "render scene.ply --cameras gone -o new": ["gone"],
