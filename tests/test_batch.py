@@ -45,38 +45,32 @@ def batch(cli):
     return cli
 
 
-def timeless(folder: Path) -> dict[str, str]:
+def timeless(folder: Path) -> dict[str, Any]:
     """Every file of results without its times."""
     found = {}
-    for path in sorted(folder.rglob("*.json")):
-        data = json.loads(path.read_text())
-        for method in data.values():
-            if isinstance(method, dict):
-                method.pop("seconds", None)
-        found[str(path.relative_to(folder))] = json.dumps(data)
-    for path in sorted(folder.rglob("*.csv")):
-        rows = [line.split(",") for line in path.read_text().splitlines()]
-        seconds = rows[0].index("seconds") - len(rows[0])  # from the end: names may hold commas
-        found[str(path.relative_to(folder))] = "\n".join(
-            ",".join(cell for i, cell in enumerate(row) if i != len(row) + seconds) for row in rows
-        )
-    for path in sorted(folder.rglob("*.png")):
-        if "plots" not in path.parts:
-            found[str(path.relative_to(folder))] = path.read_bytes().hex()
+    for path in sorted(path for path in folder.rglob("*") if "plots" not in path.parts):
+        if path.suffix == ".json":
+            data = json.loads(path.read_text())
+            content = json.dumps({n: {**v, "seconds": 0} if isinstance(v, dict) else v for n, v in data.items()})
+        elif path.suffix == ".csv":
+            rows = [line.split(",") for line in path.read_text().splitlines()]
+            seconds = rows[0].index("seconds") - len(rows[0])  # from the end: names may hold commas
+            content = [row[:seconds] + row[len(row) + seconds + 1 :] for row in rows]
+        elif path.suffix == ".png":
+            content = path.read_bytes()
+        else:
+            continue
+        found[str(path.relative_to(folder))] = content
     return found
 
 
 def test_a_broken_scene_stops_no_other_and_is_named_and_added_by_resuming_when_it_is_mended(batch):
     code, out, err = batch("evaluate --batch batch.toml")
-    assert code == 1
-    assert "failed" in out
-    assert "broken" in out
-    assert "failed: broken" in err
+    assert (code, "failed" in out, "broken" in out, "failed: broken" in err) == (1, True, True, True)
     results = json.loads(Path("out/whole/results.json").read_text())
     assert {"classic@0.5", "matched@0.5", "_aaplug"} <= set(results)
     summary = json.loads(Path("out/batch.json").read_text())
-    assert summary["scenes"]["whole"]["status"] == "done"
-    assert summary["scenes"]["broken"]["status"] == "failed"
+    assert {name: facts["status"] for name, facts in summary["scenes"].items()} == {"whole": "done", "broken": "failed"}
     assert "bytes" in summary["scenes"]["broken"]["error"]
     assert summary["mean_over"] == ["whole"]
     assert summary["mean"]["matched@0.5"] == results["matched@0.5"]
@@ -150,22 +144,21 @@ def killed_at(stop: int):
     return adding
 
 
-REFUSED = {
-    "no toml": ("scene = [", "should be TOML"),
-    "no scene": ("output = 'out'", "names no scene"),
-    "nameless": ("[[scene]]\ncameras = '.'", "names no scene; add scene"),
-    "one name": ("[[scene]]\nscene = 'a.ply'\n[[scene]]\nscene = 'b/A.ply'", "name of its own"),
-    "unknown": (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
-    "misfit": (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
-    "out of range": ("min-seen = 2" + SETTINGS, "at the top: --min-seen: takes 0..1, got 2"),
-    "not here": (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
-    "a choice": (SETTINGS + "truth = 'other'", "--truth: 'other' is not one of auto"),
-}  # fmt: skip
+REFUSED = [
+    ("scene = [", "should be TOML"),
+    ("output = 'out'", "names no scene"),
+    ("[[scene]]\ncameras = '.'", "names no scene; add scene"),
+    ("[[scene]]\nscene = 'a.ply'\n[[scene]]\nscene = 'b/A.ply'", "name of its own"),
+    (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
+    (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
+    ("min-seen = 2" + SETTINGS, "at the top: --min-seen: takes 0..1, got 2"),
+    (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
+    (SETTINGS + "truth = 'other'", "--truth: 'other' is not one of auto"),
+]
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, case):
-    text, named = REFUSED[case]
+@pytest.mark.parametrize(("text", "named"), REFUSED, ids=range(len(REFUSED)))
+def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, text, named):
     Path("bad.toml").write_text(text)
     batch.refused("evaluate --batch bad.toml", "bad.toml", named)
 
