@@ -264,6 +264,25 @@ def browser():
         chromium.close()
 
 
+@pytest.fixture
+def watched(browser) -> Iterator[Callable[..., Any]]:
+    """A function that opens an empty page; nothing may go wrong in it, and it asks for nothing elsewhere."""
+    pages, troubles = [], []
+
+    def new_page(width: int = 1280, height: int = 900, **other: Any) -> Any:
+        page = browser.new_page(viewport={"width": width, "height": height}, **other)
+        pages.append(page)
+        page.on("console", lambda line: troubles.append(line.text))
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda sent: None if sent.url.startswith(("file:", "data:")) else troubles.append(sent.url))
+        return page
+
+    yield new_page
+    for page in pages:
+        page.close()
+    assert troubles == []
+
+
 def click(box: Any) -> None:
     """Click a box of a page itself: a picture that arrives may move it away from under a mouse."""
     box.dispatch_event("click")

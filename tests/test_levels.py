@@ -282,11 +282,8 @@ def test_one_lighter_scene(cli):
     assert found.fused[0].settings == {"rate": "0.4472", "from": "150"}
     cli.done("lod scene.ply --cameras . -o counted.ply --simplify 12 --no-refine")
     assert read_scene(Path("counted.ply")).count == 12
-
-
-def test_a_budget_is_kept(cli):
-    cli.done("lod scene.ply --cameras . -o light.ply --budget 0.01 --no-refine")
-    assert 8_000 < Path("light.ply").stat().st_size <= 10_000
+    cli.done("lod scene.ply --cameras . -o budget.ply --budget 0.01 --no-refine")
+    assert 8_000 < Path("budget.ply").stat().st_size <= 10_000
 
 
 def test_what_no_camera_sees_stays_when_all_else_is_too_faint():
@@ -335,17 +332,16 @@ def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(t
 
 
 def test_what_cannot_be_merged_is_refused(tmp_path):
-    with pytest.raises(UsageError, match=r"simplify: above 1 is a count: expected a whole number, got 2\.5"):
-        aaplug.lod(make_scene(9), simplify=2.5)
-    flat = replace(make_scene(9), flat=True)
-    with pytest.raises(UsageError, match="2D Gaussians, whose levels only aaplug draws"):
-        aaplug.lod(flat, simplify=0.5, viewer="spark")
-    with pytest.raises(UsageError, match="no Gaussians"):
-        aaplug.lod(make_scene(0), simplify=0.5)
-    away = make_scene(9)
-    away.means[:] += 1000
-    with pytest.raises(FrameError, match="different frames"):
-        aaplug.lod(away, aaplug.CameraSet((make_camera(),), (make_camera(),)), simplify=0.5)
+    scene, views = make_scene(9), aaplug.CameraSet((make_camera(),), (make_camera(),))
+    away, discs = replace(scene, means=scene.means + 1000), replace(scene, flat=True)
+    for error, said, given, how in (
+        (UsageError, r"simplify: above 1 is a count: expected a whole number, got 2\.5", [scene], {"simplify": 2.5}),
+        (UsageError, "2D Gaussians, whose levels only aaplug draws", [discs], {"simplify": 0.5, "viewer": "spark"}),
+        (UsageError, "no Gaussians", [make_scene(0)], {"simplify": 0.5}),
+        (FrameError, "different frames", [away, views], {"simplify": 0.5}),
+    ):
+        with pytest.raises(error, match=said):
+            aaplug.lod(*given, **how)
     (tmp_path / "scene_lod1.ply").touch()
     with pytest.raises(OutputError, match=r"already holds scene_lod1.*or `resume` to go on"):
         aaplug.lod(make_scene(9), output=tmp_path, levels=1)

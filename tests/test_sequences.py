@@ -114,30 +114,22 @@ def test_flicker_of_a_still_scene_in_time_is_undefined(tmp_path):
     assert tables(report)[0] == "no flicker at 1/2: it needs frames that differ"
 
 
-def write(folder, name, **changes):
-    write_scene(folder / name, replace(make_scene(40), **changes), overwrite=True)
+LAST = "frame_0003.ply"
+SPOILED = [
+    ((), {}, "in: expected frame 2 after frame_0001.ply, got frame_0003.ply; or name one"),
+    (["frame_002.ply"], {}, "expected frame 3 after frame_0002.ply, got frame_002.ply"),
+    (["other1.ply", "other2.ply"], {}, "holds frames of 2 sequences (frame_####.ply, other####.ply)"),
+    ([LAST], {"sh": make_scene(40).sh[:, :1]}, f"{LAST}: expected the degree of harmonics of frame_0001.ply, "),
+    ([LAST], {"convention": MIP}, f"{LAST}: expected the convention of frame_0001.ply, classic, got mip"),
+]
 
 
-SPOILED = {
-    "in: expected frame 2 after frame_0001.ply, got frame_0003.ply; or name one": (
-        lambda folder: (folder / "frame_0002.ply").unlink()
-    ),
-    "expected frame 3 after frame_0002.ply, got frame_002.ply": lambda folder: write(folder, "frame_002.ply"),
-    "holds frames of 2 sequences (frame_####.ply, other####.ply)": (
-        lambda folder: [write(folder, f"other{number}.ply") for number in (1, 2)]
-    ),
-    "frame_0003.ply: expected the degree of harmonics of frame_0001.ply, ": (
-        lambda folder: write(folder, "frame_0003.ply", sh=make_scene(40).sh[:, :1])
-    ),
-    "frame_0003.ply: expected the convention of frame_0001.ply, classic, got mip": (
-        lambda folder: write(folder, "frame_0003.ply", convention=MIP)
-    ),
-}
-
-
-@pytest.mark.parametrize("message", SPOILED)
-def test_what_is_no_sequence_is_refused(folder, message):
-    SPOILED[message](folder)
+@pytest.mark.parametrize(("names", "changes", "message"), SPOILED, ids=range(len(SPOILED)))
+def test_what_is_no_sequence_is_refused(folder, names, changes, message):
+    for name in names:
+        write_scene(folder / name, replace(make_scene(40), **changes), overwrite=True)
+    if not names:
+        (folder / "frame_0002.ply").unlink()
     with pytest.raises(FormatError) as caught:
         read_scene(folder)
     assert message in str(caught.value)
@@ -168,9 +160,8 @@ def test_other_verbs_refuse_a_scene_in_time(folder, verb):
 
 
 def test_conversion_of_frames_needs_a_folder_and_no_fit(folder, tmp_path):
-    with pytest.raises(UsageError, match="output: of frames is a folder"):
-        aaplug.convert(folder, CAMERAS)
-    with pytest.raises(UsageError, match="output: of frames is a folder"):
-        aaplug.convert(folder, CAMERAS, tmp_path / "out.ply")
+    for output in (None, tmp_path / "out.ply"):
+        with pytest.raises(UsageError, match="output: of frames is a folder"):
+            aaplug.convert(folder, CAMERAS, output)
     with pytest.raises(UsageError, match="viewer: fits each frame alone, which flickers"):
         aaplug.convert(folder, CAMERAS, tmp_path / "out", viewer="spark")

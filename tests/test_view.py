@@ -12,7 +12,7 @@ import torch
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.imaging import average_samples, box_average, quantised
-from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, opencv_lens
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, PINHOLE, opencv_lens
 from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import read_image, write_png
@@ -103,11 +103,24 @@ def finished(steps):
         taken += 1
 
 
-@pytest.mark.parametrize(("recipe", "scale"), [("classic", 1.0), ("auto", 0.5), ("auto", 0.125)])
-def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
+LENSES = (EQUIDISTANT, opencv_lens((-0.2, 0.05)), EQUIRECT)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "scale", "lens"),
+    [
+        ("classic", 1.0, PINHOLE),
+        ("auto", 0.5, PINHOLE),
+        ("auto", 0.125, PINHOLE),
+        *(("classic", 1.0, x) for x in LENSES),
+    ],
+)
+def test_strips_are_the_picture(seen, recipe, scale, lens, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 1000)
     renderer = Renderer.of(*seen, recipe, quality="best", rasterizer="eager")
-    camera = seen[1].train[0].scaled(scale)
+    camera = replace(seen[1].train[0].scaled(scale), lens=lens)
+    if lens != PINHOLE:
+        camera = replace(camera, fx=camera.width / (2 * math.pi), fy=camera.width / (2 * math.pi))
     whole = renderer(camera)
     middle = camera.width // 3
     for columns in (None, (0, middle), (middle, camera.width)):
@@ -115,17 +128,6 @@ def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
         for image, expected in zip(render, whole, strict=True):
             torch.testing.assert_close(image, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
         assert taken > 1 or scale < 0.5
-
-
-@pytest.mark.parametrize("lens", [EQUIDISTANT, opencv_lens((-0.2, 0.05)), EQUIRECT], ids=lambda lens: lens.projection)
-def test_strips_through_a_lens_are_the_picture(seen, lens, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 1000)
-    renderer = Renderer.of(*seen, "classic", rasterizer="eager")
-    camera = replace(seen[1].train[0], lens=lens)
-    camera = replace(camera, fx=camera.width / (2 * math.pi), fy=camera.width / (2 * math.pi))
-    render, taken = finished(strips(renderer, camera, 1, (10, camera.width)))
-    assert taken > 1
-    torch.testing.assert_close(render.rgb, renderer(camera).rgb[:, 10:], atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("samples", [1, 3])

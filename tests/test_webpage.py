@@ -82,10 +82,15 @@ def test_plots_are_files_too_and_do_not_change(written):
     assert not (folder / "plots" / "seconds.svg").exists()  # a curve of times would draw noise
 
 
+def axes_of(report, found, measurements):
+    return plots(replace(report, measurements=tuple(measurements)), found)[0].draw("black").axes[0]
+
+
 def test_curves_of_many_recipes_differ_in_colour_or_marker(written):
     _, report, found = written
-    many = [replace(m, recipe=f"{m.recipe} {i}") for i in range(12) for m in report.measurements]
-    axes = plots(replace(report, measurements=tuple(many)), found)[0].draw("black").axes[0]
+    axes = axes_of(
+        report, found, [replace(m, recipe=f"{m.recipe} {i}") for i in range(12) for m in report.measurements]
+    )
     looks = {(line.get_color(), line.get_marker()) for line in axes.lines}
     assert len(looks) == len(axes.lines) == 36
 
@@ -93,8 +98,7 @@ def test_curves_of_many_recipes_differ_in_colour_or_marker(written):
 def test_the_legend_names_each_curve_in_the_width_of_the_plot(written):
     _, report, found = written
     names = {"classic": "_" + "x" * 300 + "_1", "auto": "_" + "x" * 300 + "_2"}
-    renamed = [replace(m, recipe=names.get(m.recipe, m.recipe)) for m in report.measurements]
-    axes = plots(replace(report, measurements=tuple(renamed)), found)[0].draw("black").axes[0]
+    axes = axes_of(report, found, [replace(m, recipe=names.get(m.recipe, m.recipe)) for m in report.measurements])
     texts = [text.get_text() for text in axes.get_legend().get_texts()]
     assert [text[-2:] for text in texts[:2]] == ["_1", "_2"]
     assert len(texts) == len(axes.lines)
@@ -132,25 +136,16 @@ def test_the_figures_of_a_single_view_have_no_spread(written, views, said):
 
 
 @pytest.fixture
-def opened(browser, written):
-    """A function that opens the page in a window of some size and scheme; nothing may have gone wrong in it."""
-    troubles, pages, asked = [], [], []
+def opened(watched, written):
+    """A function that opens the page in a window of some size and scheme."""
 
     def open_page(width=1280, height=900, scheme="light", address="", **other):
-        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, **other)
-        pages.append(page)
-        page.on("console", lambda message: troubles.append(message.text))
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
+        page = watched(width, height, color_scheme=scheme, **other)
         page.goto((written[0] / "report.html").as_uri() + address)
         page.wait_for_selector("#compare[data-shown]")
         return page
 
-    yield open_page
-    for page in pages:
-        page.close()
-    assert troubles == []
-    assert all(url.startswith(("file:", "data:")) for url in asked)
+    return open_page
 
 
 def data(page, name: str) -> str:
@@ -322,12 +317,12 @@ def test_an_address_of_a_section_or_of_nonsense_does_no_harm(opened):
         assert (data(page, "shown"), data(page, "lens"), data(page, "split")) == (usual, "off", "0.500")
 
 
-def test_long_names_are_whole_on_a_desktop_and_on_paper(browser, tmp_path, plots_drawn_once):
+def test_long_names_are_whole_on_a_desktop_and_on_paper(watched, tmp_path, plots_drawn_once):
     scenes = {f"a_scene_whose_name_is_as_long_as_{name}.ply": make_scene(150, seed) for seed, name in enumerate("ab")}
     scenes["x" * 200] = make_scene(150, 2)
     views = tuple(make_camera((place, -4.0, 1.0), name=f"view_at_{place}_metres") for place in (0.0, 2.0))
     compare(scenes, CameraSet(views, views), tmp_path, metric="psnr", rasterizer="eager", any_frame=True)
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page = watched()
     page.goto((tmp_path / "report.html").as_uri())
     whole = "[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)"
     assert page.evaluate(whole)
@@ -341,7 +336,6 @@ def test_long_names_are_whole_on_a_desktop_and_on_paper(browser, tmp_path, plots
     assert page.evaluate("document.documentElement.scrollWidth") == 1280
     line, label = (page.locator(f"#stage .labels{part}").bounding_box() for part in ("", " span >> nth=0"))
     assert label["width"] > 0.4 * line["width"]
-    page.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -393,11 +387,10 @@ def test_a_page_of_streamed_levels_says_why_it_shows_none(browser, tmp_path):
     page.close()
 
 
-def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser):
+def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(watched):
     """By the camera's place: up to one side of an up that is x, before a canvas twice as high as wide."""
     script = files("aaplug.io.stream_pages").joinpath("orbit.js").read_text()
-    page = browser.new_page()
-    eyes = page.evaluate(
+    eyes = watched().evaluate(
         """async (script) => {
           const { orbit } = await import("data:text/javascript," + encodeURIComponent(script));
           const canvas = document.body.appendChild(document.createElement("canvas"));
@@ -415,7 +408,6 @@ def test_a_page_of_streamed_levels_turns_and_zooms_by_mouse_and_fingers(browser)
         }""",
         script,
     )
-    page.close()
     first, turned, pinched, wheeled = (torch.tensor(eye["eye"]) - torch.tensor([5.0, 0.0, 0.0]) for eye in eyes)
     far = 2 / math.sin(math.atan(math.tan(math.pi / 8) / 2))
     torch.testing.assert_close(first, far * torch.tensor([math.sin(0.35), math.cos(0.35), 0.0]))
