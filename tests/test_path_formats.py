@@ -3,7 +3,6 @@
 import base64
 import json
 import math
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import torch
 
 from aaplug.io.cameras import read_camera_path, read_cameras
+from aaplug.io.gltf import glb_start
 from aaplug.system.errors import AaplugError, FormatError, UsageError
 from tests.scene_files import with_value
 from tests.test_cameras_io import FIXTURES
@@ -75,17 +75,18 @@ def binary() -> bytes:
 
 
 def glb(folder: Path) -> Path:
-    document = json.dumps(gltf(binary())).encode()
-    document += b" " * (-len(document) % 4)
-    chunks = [(0x4E4F534A, document), (0x004E4942, binary())]
-    body = b"".join(struct.pack("<II", len(data), kind) + data for kind, data in chunks)
-    (folder / "path.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    (folder / "path.glb").write_bytes(glb_start(gltf(binary()), len(binary())) + binary())
     return folder / "path.glb"
 
 
 def gltf_with_buffer(folder: Path) -> Path:
     (folder / "path.bin").write_bytes(binary())
     return written(folder, "path.gltf", gltf(binary(), "path.bin"))
+
+
+def gltf_with_data(folder: Path) -> Path:
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary()).decode()
+    return written(folder, "path.gltf", gltf(binary(), uri))
 
 
 def written(folder: Path, name: str, content: object) -> Path:
@@ -135,16 +136,9 @@ def test_lichtfelds_timeline_is_turned_into_the_scenes_axes_and_eased(tmp_path):
     assert last.fy == pytest.approx(2 * first.fy)
 
 
-@pytest.mark.parametrize("kind", ["glb", "file", "data"])
-def test_a_camera_of_gltf_moves_with_the_nodes_above_it(tmp_path, kind):
-    if kind == "glb":
-        file = glb(tmp_path)
-    elif kind == "file":
-        file = gltf_with_buffer(tmp_path)
-    else:
-        uri = "data:application/octet-stream;base64," + base64.b64encode(binary()).decode()
-        file = written(tmp_path, "path.gltf", gltf(binary(), uri))
-    path = read_camera_path(file)
+@pytest.mark.parametrize("make", [glb, gltf_with_buffer, gltf_with_data])
+def test_a_camera_of_gltf_moves_with_the_nodes_above_it(tmp_path, make):
+    path = read_camera_path(make(tmp_path))
     assert (path.fps, len(path.cameras)) == (10, 21)
     camera = path.cameras[10]
     assert camera.centre.tolist() == pytest.approx([1, 0, 5], abs=1e-6)
@@ -288,12 +282,13 @@ def test_usd_without_its_package_names_the_extra(tmp_path, monkeypatch):
         read_camera_path(written(tmp_path, "path.usda", USDA))
 
 
-@pytest.mark.parametrize("name", ["supersplat", "lichtfeld", "gltf", "usd"])
-def test_a_path_of_keys_lasts_as_long_at_another_frame_rate(tmp_path, name):
-    documents = {"supersplat": ("a.json", SETTINGS), "lichtfeld": ("a.json", TIMELINE), "usd": ("a.usda", USDA)}
-    if name == "usd":
+@pytest.mark.parametrize(
+    ("name", "document"), [("a.json", SETTINGS), ("a.json", TIMELINE), ("a.usda", USDA), ("", None)]
+)
+def test_a_path_of_keys_lasts_as_long_at_another_frame_rate(tmp_path, name, document):
+    if document == USDA:
         pytest.importorskip("pxr")
-    file = glb(tmp_path) if name == "gltf" else written(tmp_path, *documents[name])
+    file = written(tmp_path, name, document) if name else glb(tmp_path)
     path = read_camera_path(file)
     finer = read_camera_path(file, fps=2 * path.fps)
     assert (finer.fps, finer.shutter) == (2 * path.fps, path.shutter)
@@ -310,22 +305,22 @@ def test_cameras_of_a_data_set_are_a_path_in_their_order(tmp_path, name):
     assert all(camera.trained_focal is None and camera.photo is None for camera in cameras)
 
 
-WRONG = {
-    "settings": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "times"), [0, 5, 5]),
-    "angle": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "fov"), [60, 180, 60]),
-    "at the target": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "target"), [0, 0, 4] * 3),
-    "too long": ("a.json", SETTINGS, ("animTracks", 0, "duration"), 1e9),
-    "version": ("a.json", SETTINGS, ("version",), 3),
-    "timeline": ("a.json", TIMELINE, ("version",), 5),
-    "no rotation": ("a.json", TIMELINE, ("keyframes", 1, "rotation"), [0, 0, 0, 0]),
-    "easing": ("a.json", TIMELINE, ("keyframes", 1, "easing"), 0.5),
-    "focal length": ("a.json", TIMELINE, ("keyframes", 1, "focal_length_mm"), 0),
-    "no camera": ("a.gltf", gltf(b"", "x"), ("nodes",), [{}]),
-    "a circle": ("a.gltf", gltf(b"", "x"), ("nodes", 1, "children"), [0]),
-    "orthographic": ("a.gltf", gltf(b"", "x"), ("cameras", 0, "type"), "orthographic"),
-    "no buffer": ("a.gltf", gltf(b"", "data:,"), ("buffers", 0, "byteLength"), 5),
-    "glTF 1": ("a.gltf", gltf(b"", "x"), ("asset", "version"), "1.0"),
-}  # fmt: skip
+WRONG = [
+    ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "times"), [0, 5, 5]),
+    ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "fov"), [60, 180, 60]),
+    ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "target"), [0, 0, 4] * 3),  # at the camera
+    ("a.json", SETTINGS, ("animTracks", 0, "duration"), 1e9),
+    ("a.json", SETTINGS, ("version",), 3),
+    ("a.json", TIMELINE, ("version",), 5),
+    ("a.json", TIMELINE, ("keyframes", 1, "rotation"), [0, 0, 0, 0]),
+    ("a.json", TIMELINE, ("keyframes", 1, "easing"), 0.5),
+    ("a.json", TIMELINE, ("keyframes", 1, "focal_length_mm"), 0),
+    ("a.gltf", gltf(b"", "x"), ("nodes",), [{}]),  # no camera
+    ("a.gltf", gltf(b"", "x"), ("nodes", 1, "children"), [0]),  # a circle
+    ("a.gltf", gltf(b"", "x"), ("cameras", 0, "type"), "orthographic"),
+    ("a.gltf", gltf(b"", "data:,"), ("buffers", 0, "byteLength"), 5),
+    ("a.gltf", gltf(b"", "x"), ("asset", "version"), "1.0"),
+]
 
 
 def test_numbers_of_gltf_that_many_channels_share_have_a_limit_in_all(tmp_path, monkeypatch):
@@ -342,11 +337,10 @@ def test_numbers_of_gltf_that_many_channels_share_have_a_limit_in_all(tmp_path, 
         read_camera_path(file)
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_a_broken_path_is_refused(tmp_path, case):
-    name, *changed = WRONG[case]
+@pytest.mark.parametrize(("name", "document", "place", "value"), WRONG, ids=range(len(WRONG)))
+def test_a_broken_path_is_refused(tmp_path, name, document, place, value):
     with pytest.raises(FormatError):
-        read_camera_path(written(tmp_path, name, with_value(*changed)))
+        read_camera_path(written(tmp_path, name, with_value(document, place, value)))
 
 
 def test_garbage_is_refused(tmp_path):
