@@ -244,17 +244,17 @@ def test_a_cluster_without_workers_or_without_a_folder_is_refused(monkeypatch):
             cluster.connected(scheduler, 0, None, SILENT).__enter__()
 
 
-REFUSED = {
-    "tcp://127.0.0.1:9": "scheduler tcp://127.0.0.1:9: nothing answers there within 0 s",
-    "nowhere": "--scheduler: takes local or an address such as tcp://host:8786, got nowhere",
-}
-
-
-@pytest.mark.parametrize("address", REFUSED)
-def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("tcp://127.0.0.1:9", "scheduler tcp://127.0.0.1:9: nothing answers there within 0 s"),
+        ("nowhere", "--scheduler: takes local or an address such as tcp://host:8786, got nowhere"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_is_one_line(address, said, cli, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
     line = cli.refused(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
-    assert line == f"error: {REFUSED[address]}"
+    assert line == f"error: {said}"
 
 
 def test_without_the_extra_its_name_is_told(cli, monkeypatch):

@@ -65,9 +65,8 @@ def test_the_integers_that_the_extension_allows_are_read(tmp_path: Path):
         rows = table.reshape(40, -1)
         padded = np.zeros((40, -(-rows.nbytes // 40 // 4) * 4), np.uint8)
         padded[:, : rows.nbytes // 40] = rows.view(np.uint8).reshape(40, -1)
-        content["buffers"].append(
-            {"byteLength": padded.nbytes, "uri": "data:;base64," + base64.b64encode(padded.tobytes()).decode()}
-        )
+        uri = "data:;base64," + base64.b64encode(padded.tobytes()).decode()
+        content["buffers"].append({"byteLength": padded.nbytes, "uri": uri})
         view = {"buffer": len(content["buffers"]) - 1, "byteLength": padded.nbytes, "byteStride": padded.shape[1]}
         content["bufferViews"].append(view)
         accessor = content["accessors"][attributes[f"{SPLATS}:{name}"]]
@@ -81,30 +80,28 @@ def test_the_integers_that_the_extension_allows_are_read(tmp_path: Path):
     torch.testing.assert_close(rows.log_scales.exp(), torch.from_numpy(tables["SCALE"][1].astype(np.float32)))
 
 
-WRONG = {
-    "outside of the folder": (("buffers", 0, "uri"), "..%2Fa.bin", "a file in the same folder"),
-    "a file that is not there": (("buffers", 0, "uri"), "b%20c.bin", "b.gltf: refers to b c.bin, which is not there"),
-    "a required extension": (("extensionsRequired",), ["EXT_meshopt_compression"], "extensionsRequired should be of"),
-    "an unlike scale": (("nodes",), [{"mesh": 0, "scale": [1, 2, 1]}], "a turn, a move and one scale"),
-    "a mirror": (("nodes",), [{"mesh": 0, "scale": [1, 1, -1]}], "a turn, a move and one scale"),
-    "triangles": (("meshes", 0, "primitives", 0, "mode"), 4, "mode should be 0"),
-    "another kernel": (
-        ("meshes", 0, "primitives", 0, "extensions", SPLATS, "kernel"), "box", "kernel should be 'ellipse'|ellipse",
-    ),
-    "no splats": (("meshes", 0, "primitives", 0, "extensions"), {}, "holds no points"),
-    "unequal rows": (("accessors", 1, "count"), 39, "as many rows each"),
-    "too many rows": (("accessors", 1, "count"), 10**9, "whole number from 0 to"),
-    "another type": (("accessors", 2, "componentType"), 5125, "a dense VEC3"),
-    "sparse": (("accessors", 2, "sparse"), {}, "a dense VEC3"),
-    "a compressed view": (("bufferViews", 0, "extensions"), {"EXT_meshopt_compression": {}}, "should be none"),
-    "a circle": (("nodes",), [{"mesh": 0, "children": [0]}], "circle"),
-    "a damaged record": (("meshes", 0, "primitives", 0, "extras", "aaplug", "convention"), "odd", "should be one of"),
-}  # fmt: skip
+PRIMITIVE = ("meshes", 0, "primitives", 0)
+WRONG = [
+    (("buffers", 0, "uri"), "..%2Fa.bin", "a file in the same folder"),
+    (("buffers", 0, "uri"), "b%20c.bin", "b.gltf: refers to b c.bin, which is not there"),
+    (("extensionsRequired",), ["EXT_meshopt_compression"], "extensionsRequired should be of"),
+    (("nodes",), [{"mesh": 0, "scale": [1, 2, 1]}], "a turn, a move and one scale"),
+    (("nodes",), [{"mesh": 0, "scale": [1, 1, -1]}], "a turn, a move and one scale"),
+    ((*PRIMITIVE, "mode"), 4, "mode should be 0"),
+    ((*PRIMITIVE, "extensions", SPLATS, "kernel"), "box", "kernel should be 'ellipse'|ellipse"),
+    ((*PRIMITIVE, "extensions"), {}, "holds no points"),
+    (("accessors", 1, "count"), 39, "as many rows each"),
+    (("accessors", 1, "count"), 10**9, "whole number from 0 to"),
+    (("accessors", 2, "componentType"), 5125, "a dense VEC3"),
+    (("accessors", 2, "sparse"), {}, "a dense VEC3"),
+    (("bufferViews", 0, "extensions"), {"EXT_meshopt_compression": {}}, "should be none"),
+    (("nodes",), [{"mesh": 0, "children": [0]}], "circle"),
+    ((*PRIMITIVE, "extras", "aaplug", "convention"), "odd", "should be one of"),
+]
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_what_cannot_be_read_right_is_refused(tmp_path: Path, what: str):
-    place, value, problem = WRONG[what]
+@pytest.mark.parametrize(("place", "value", "problem"), WRONG, ids=range(len(WRONG)))
+def test_what_cannot_be_read_right_is_refused(tmp_path: Path, place, value, problem: str):
     with pytest.raises(FormatError, match=problem):
         read_scene(written(tmp_path, with_value(document(tmp_path), place, value))).gaussians()
 
@@ -178,17 +175,15 @@ def test_every_validator_of_usd_is_content(tmp_path: Path, name: str):
 
 def stage(folder: Path, scene: Gaussians, **changes: object) -> Path:
     """A text layer of halves, z up, as another program may write it."""
-    facts = {"up": "Z", "degree": 0, "scales": [list(s) for s in scene.scales.tolist()], "more": "", "layers": ""}
-    facts |= changes
+    facts = {"up": "Z", "degree": 0, "scales": scene.scales.tolist(), "more": "", "layers": ""} | changes
     rows = {
-        "positionsh": ("point3h", [tuple(m) for m in scene.means.tolist()]),
-        "orientationsh": ("quath", [tuple(q) for q in scene.unit_quats.tolist()]),
-        "scalesh": ("half3", [tuple(s) for s in facts["scales"]]),
-        "opacitiesh": ("half", scene.opacities.tolist()),
-        "radiance:sphericalHarmonicsCoefficientsh": ("half3", [tuple(c) for c in scene.sh[:, 0].tolist()]),
+        "point3h[] positionsh": scene.means.tolist(),
+        "quath[] orientationsh": scene.unit_quats.tolist(),
+        "half3[] scalesh": facts["scales"],
+        "half[] opacitiesh": scene.opacities.tolist(),
+        "half3[] radiance:sphericalHarmonicsCoefficientsh": scene.sh[:, 0].tolist(),
     }
-    lines = [f"    {kind}[] {name} = {json.dumps(values).replace('[', '(').replace(']', ')')}" for name, (kind, values) in rows.items()]  # noqa: E501  # fmt: skip
-    lines = [line.replace("= (", "= [", 1)[:-1] + "]" for line in lines]
+    lines = [f"    {name} = {[tuple(v) if isinstance(v, list) else v for v in rows[name]]}" for name in rows]
     text = f"""#usda 1.0
 (
     upAxis = "{facts["up"]}"

@@ -126,9 +126,6 @@ REFUSED = {
 def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatch, words):
     monkeypatch.setattr(Renderer, "draw", None)
     cli.refused(f"{WORDS} {words}", REFUSED[words])
-
-
-def test_render_writes_no_sequence(cli):
     for views in ("r_1", "test"):
         said = "f.####.png: names a frame sequence, which `video` writes; name a folder, or one image"
         cli.refused(f"render scene.ply --cameras . --views {views} -o f.####.png", said)

@@ -128,11 +128,9 @@ REFUSED = {
 def test_a_path_may_begin_at_home(monkeypatch, tmp_path):
     """A shell replaces ~ at the beginning of a word alone, so not in --output=~/out."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    words = "render ~/s.ply --output=~/out --cameras=~/c --path=~/p.json"
-    given = VERBS["render"].parse(words.split()[1:])
-    assert [getattr(given, name) for name in ("scene", "output", "cameras", "path")] == [
-        tmp_path / name for name in ("s.ply", "out", "c", "p.json")
-    ]
+    given = VERBS["render"].parse(["~/s.ply", "--output=~/out", "--cameras=~/c", "--path=~/p.json"])
+    assert (given.scene, given.output) == (tmp_path / "s.ply", tmp_path / "out")
+    assert (given.cameras, given.path) == (tmp_path / "c", tmp_path / "p.json")
     (tmp_path / "b.toml").write_text('[[scene]]\nscene = "~/s.ply"\nlpips = ["~/a", "b"]')
     _, scenes = read_batch(tmp_path / "b.toml")
     assert scenes["s"] == {"scene": str(tmp_path / "s.ply"), "lpips": [str(tmp_path / "a"), str(tmp_path / "b")]}

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import struct
 import zlib
 from dataclasses import replace
@@ -38,8 +39,8 @@ def small_leaves(monkeypatch):
     monkeypatch.setattr("aaplug.verbs.lod.MAX_CHUNK_GAUSSIANS", 25)
 
 
-def made(folder, to, **how):
-    return aaplug.lod(SCENE, CAMERAS, folder, to=to, **HOW | how)
+def made(folder, to, scene=SCENE, cameras=CAMERAS, **how):
+    return aaplug.lod(scene, cameras, folder, to=to, **HOW | how)
 
 
 def moved(cameras, by):
@@ -90,7 +91,7 @@ def test_a_complete_stream_is_refused_and_complete_only_for_as_many_levels(tmp_p
 def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves, far):
     """By the specification: an error over distance in px, and a child's box and error within its parent's."""
     whole = FAR_SCENE if far else SCENE
-    levels = aaplug.lod(whole, moved(CAMERAS, UTM * far), tmp_path / "out", to="3dtiles", **HOW)
+    levels = made(tmp_path / "out", "3dtiles", whole, moved(CAMERAS, UTM * far))
     index = json.loads((tmp_path / "out" / "tileset.json").read_text())
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert (index["asset"]["version"], required) == ("1.1", streamed.SPLATS)
@@ -125,18 +126,15 @@ def test_a_viewer_without_transforms_is_told_to_move_far_gaussians(tmp_path, cap
     streamed.check_positions(tmp_path, to, replace(SCENE, log_scales=SCENE.log_scales - 20))
     made(tmp_path / "near", to)
     assert not caplog.messages, "moving would not help"
-    aaplug.lod(FAR_SCENE, moved(CAMERAS, UTM), tmp_path / "far", to=to, **HOW)
-    assert caplog.messages[0].startswith(f"{tmp_path / 'far'}: {viewer} moves ")
-    assert caplog.messages[0].endswith(
-        " of 200 Gaussians by more than their size, so far from the origin; "
-        "move the scene by aaplug merge, or write 3dtiles"
-    )
+    made(tmp_path / "far", to, FAR_SCENE, moved(CAMERAS, UTM))
+    said = "of 200 Gaussians by more than their size, so far from the origin; move the scene by aaplug merge, or write "
+    assert re.fullmatch(rf"{tmp_path / 'far'}: {viewer} moves \d+ {said}3dtiles", caplog.messages[0])
 
 
 def test_3d_tiles_refuse_what_lies_too_far_apart_before_anything_is_written(tmp_path):
     apart = replace(SCENE, means=SCENE.means.index_fill(0, torch.tensor(7), 5e6))
     with pytest.raises(OutputError, match=r"out: 3D Tiles cannot hold a position 5e\+06 units from the scene's middle"):
-        aaplug.lod(apart, CAMERAS, tmp_path / "out", to="3dtiles", **HOW)
+        made(tmp_path / "out", "3dtiles", apart)
     assert not list(tmp_path.iterdir())
 
 
@@ -178,9 +176,8 @@ def test_a_rad_is_a_tree_of_the_levels(tmp_path, monkeypatch):
     scene = make_scene(400)
     seen = scene[median_rates(scene.means, CAMERAS.train) > 0]
     small = replace(seen, log_scales=seen.log_scales - 2)
-    how = {"to": "rad", "levels": LEVELS, "refine": False, "min_seen": 0.0}
-    aaplug.lod(small, CAMERAS, tmp_path, **how)
-    levels, found = aaplug.lod(small, CAMERAS, None, **how), read_rad(tmp_path / "scene.rad")
+    made(tmp_path, "rad", small)
+    levels, found = made(None, "rad", small), read_rad(tmp_path / "scene.rad")
     assert len(levels[0].scene) > len(levels[1].scene) > len(levels[2].scene)
     counts, starts = (found[name][:, 0].astype(int) for name in ("child_count", "child_start"))
     children = [np.arange(start, start + count) for start, count in zip(starts, counts, strict=True)]
@@ -322,18 +319,16 @@ def test_spark_draws_a_small_gaussian_below_large_ones():
     assert rad.shown_of(torch.tensor([9.0, 1.0]), torch.tensor([-1, -1])).tolist() == [0, 1]
 
 
-@pytest.mark.parametrize("scene", ["faint", "large, of degree 4", "in float64", "large, alone"])
+FAINT = replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20)
+LARGE = replace(make_scene(200, degree=4), log_scales=SCENE.log_scales + 3)
+
+
+@pytest.mark.parametrize("scene", [FAINT, LARGE, SCENE.to(torch.float64), LARGE[:1]], ids=range(4))
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
-    given = {
-        "faint": replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20),
-        "large, of degree 4": replace(make_scene(200, degree=4), log_scales=SCENE.log_scales + 3),
-        "in float64": SCENE.to(torch.float64),
-        "large, alone": replace(SCENE, log_scales=SCENE.log_scales + 3)[:1],
-    }[scene]
-    for tuning in {"refine": False}, {"steps": 1, "overwrite": True}:
-        levels = aaplug.lod(given, CAMERAS, tmp_path, to="rad", levels=LEVELS, min_seen=0.0, **tuning)
-        assert len(levels[0].scene) == len(given)
-    assert bool(read_rad(tmp_path / "scene.rad")["child_count"].max() > 0) is (len(given) > 1)
+    for tuning in {}, {"refine": True, "steps": 1, "overwrite": True}:
+        levels = made(tmp_path, "rad", scene, **tuning)
+        assert len(levels[0].scene) == len(scene)
+    assert bool(read_rad(tmp_path / "scene.rad")["child_count"].max() > 0) is (len(scene) > 1)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.rad", streamed.SETTINGS}
 
 
