@@ -313,18 +313,14 @@ def test_needles_are_counted(tmp_path):
     assert aaplug.info(tmp_path / "a.ply")["needle_share"] == 0.25
 
 
-def test_a_scene_of_nothing_is_refused(cli):
+def test_a_scene_in_one_place_is_shown_and_one_of_nothing_is_refused(cli):
+    for count in (1, 30):
+        write_scene("point.ply", replace(make_scene(count), means=torch.full((count, 3), 2.0)), overwrite=True)
+        cli.done("render point.ply -o new.png --resolution 30x30 --background white --overwrite")
+        assert read_image(Path("new.png"), None).std() > 0.01
     write_scene("empty.ply", make_scene(0))
     cli.refused("render empty.ply -o new", "empty.ply: has no Gaussians to look at")
     cli.done("info empty.ply")
-
-
-@pytest.mark.parametrize("count", [1, 30])
-def test_a_scene_in_one_place_is_shown(cli, count):
-    scene = make_scene(count)
-    write_scene("point.ply", replace(scene, means=torch.full_like(scene.means, 2.0)))
-    cli.done("render point.ply -o new.png --resolution 30x30 --background white")
-    assert read_image(Path("new.png"), None).std() > 0.01
 
 
 def test_looking_straight_down_has_a_picture():

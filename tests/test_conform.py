@@ -3,13 +3,13 @@
 import json
 import shlex
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
 
 import aaplug
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.evaluation import conformance
 from aaplug.evaluation.conformance import CAMERA, FAULTS, NONE, TESTS, Conformance, Fault, judged
@@ -37,16 +37,8 @@ CONVENTIONS = ("classic", "antialiased", "mip", "playcanvas", "playcanvas-classi
 @pytest.fixture(scope="module", autouse=True)
 def drawn_once():
     """What is expected of a renderer is drawn once for all of these tests."""
-    draw, memory = conformance.draw, dict[tuple[object, ...], torch.Tensor]()
-
-    def kept(scene: Gaussians, viewer: Viewer, broken: Fault = NONE, white: bool = False) -> torch.Tensor:
-        key = id(scene), viewer.name, broken.words, white
-        if key not in memory:
-            memory[key] = draw(scene, viewer, broken, white)
-        return memory[key]
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(conformance, "draw", kept)
+        patch.setattr(conformance, "draw", cache(conformance.draw))
         yield
 
 

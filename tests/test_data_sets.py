@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -109,29 +110,18 @@ def test_the_papers_figures_stand_above_ours_at_their_scales(whole):
     assert "published" not in table  # they are means of all scenes
 
 
-def of_another_scene(folder: Path) -> str:
-    file = folder / f"{folder.name}.ply"
-    scene = read_scene(file).gaussians()
-    turned = aaplug.Gaussians(-scene.means + 6, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
-    write_scene(file, turned, overwrite=True)
-    return "only 0.0% of its Gaussians are seen"
-
-
-def truncated(folder: Path) -> str:
-    photo = folder / "test" / "r_0.png"
-    photo.write_bytes(photo.read_bytes()[:-40])
-    return "r_0.png"
-
-
-def of_another_size(folder: Path) -> str:
-    photo = folder / "test" / "r_0.png"
-    Image.open(photo).resize((30, 30)).save(photo)
-    return "r_0.png: is 30x30 px, of another shape than the cameras say 64x48"
-
-
 def test_scenes_that_fail_are_named_and_not_averaged(whole):
-    spoiled = {"drums": of_another_size, "mic": truncated, "ship": of_another_scene}
-    named = {name: spoil(Path("data", name)) for name, spoil in spoiled.items()}
+    data = Path("data")
+    scene = read_scene(data / "ship" / "ship.ply").gaussians()
+    write_scene(data / "ship" / "ship.ply", replace(scene, means=-scene.means + 6, origin=None), overwrite=True)
+    cut, small = (data / name / "test" / "r_0.png" for name in ("mic", "drums"))
+    cut.write_bytes(cut.read_bytes()[:-40])
+    Image.open(small).resize((30, 30)).save(small)
+    named = {
+        "ship": "only 0.0% of its Gaussians are seen",
+        "mic": "r_0.png",
+        "drums": "r_0.png: is 30x30 px, of another shape than the cameras say 64x48",
+    }
     code, out, _ = whole(RUN)
     assert code == 1
     assert "mean of" not in out

@@ -148,13 +148,9 @@ def write_cameras(folder: Path) -> None:
         step = len(data["frames"]) // count if split == "train" else 1
         data |= {"frames": data["frames"][::step][:count], "w": SIZE, "h": SIZE}
         (folder / f"transforms_{split}.json").write_text(json.dumps(data))
-    for name in ("r_8", "r_24"):
-        small(SAMPLE / "test" / f"{name}.png", folder / "test" / f"{name}.png")
-
-
-def small(source: Path, target: Path) -> None:
-    with Image.open(source) as image:
-        image.resize((SIZE, SIZE)).save(target)
+    for name in ("r_8.png", "r_24.png"):
+        with Image.open(SAMPLE / "test" / name) as image:
+            image.resize((SIZE, SIZE)).save(folder / "test" / name)
 
 
 def write_photographed_model(folder: Path, scene: Gaussians, photographs: Path) -> None:

@@ -18,11 +18,6 @@ from tests.conftest import run_python
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
 
-def range_of(hint: Any) -> list[Argument]:
-    """The ranges that an annotation states: one for a number, none for others."""
-    return [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Argument) and ".." in part.takes]
-
-
 def fits(spec: Argument, value: Any) -> bool:
     """True if a value is not refused."""
     try:
@@ -37,10 +32,11 @@ def numeric(hint: Any) -> bool:
 
 
 def numbers(options: type[Options]) -> dict[str, list[Any]]:
-    """The options of a class that take numbers, with their ranges."""
+    """The options of a class that take numbers, with their ranges: one for each, as the annotation states it."""
     hints, plain = get_type_hints(options, include_extras=True), get_type_hints(options)
     named = [n for n, hint in plain.items() if numeric(hint) and n != "background"]  # a colour or a name
-    return {name: range_of(hints[name]) for name in named}
+    stated = {name: getattr(hints[name], "__metadata__", ()) for name in named}
+    return {n: [p for p in parts if isinstance(p, Argument) and ".." in p.takes] for n, parts in stated.items()}
 
 
 ALL = sorted({group for verb in VERBS.values() for group in verb.classes}, key=lambda c: c.__name__)

@@ -674,17 +674,13 @@ def test_a_failure_while_writing_leaves_the_old_scene(tmp_path: Path, monkeypatc
     assert list(tmp_path.iterdir()) == [path]
 
 
-def inria_model(folder: Path, *iterations: str) -> Path:
-    for iteration in iterations:
-        scene = folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
-        scene.parent.mkdir(parents=True)
-        scene.write_bytes(File().content)
-    (folder / "point_cloud" / "iteration_99999").mkdir(parents=True)
-    return folder
-
-
 def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
-    model = inria_model(tmp_path, "7000", "30000", "best")
+    model = tmp_path
+    for iteration in ("7000", "30000", "best", "99999"):
+        folder = model / "point_cloud" / f"iteration_{iteration}"
+        folder.mkdir(parents=True)
+        if iteration != "99999":
+            (folder / "point_cloud.ply").write_bytes(File().content)
     assert find_scene(model).parent.name == "iteration_30000"
     assert find_scene(model, 7000).parent.name == "iteration_7000"
     assert read_scene(model).title == model.name

@@ -36,16 +36,11 @@ def hooks() -> dict[str, object]:
     return runpy.run_path(str(SITE / "hooks.py"))
 
 
-def row_of(recipe: str) -> str:
-    """A recipe's row of the first table of methods.md."""
-    rows = METHODS.split("## Measured")[0].splitlines()
-    (found,) = (row for row in rows if re.match(rf"\| [^|]*`{recipe}`[^|]* \|", row))
-    return found
-
-
 @pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
 def test_each_recipe_has_a_row_with_its_paper_beside_it(recipe):
-    assert PAPER.search(row_of(recipe.name)) or recipe.source.startswith(OURS)
+    rows = METHODS.split("## Measured")[0].splitlines()  # of the first table
+    (found,) = (row for row in rows if re.match(rf"\| [^|]*`{recipe.name}`[^|]* \|", row))
+    assert PAPER.search(found) or recipe.source.startswith(OURS)
 
 
 def test_links_to_papers_say_what_they_lead_to():
