@@ -135,18 +135,7 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         assert timeless(Path("out")) == whole
 
 
-def test_scenes_are_converted_to_the_same_bytes(local, cli):
-    Path("many.toml").write_text(
-        "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
-        "cameras = '.'\nvariance = 0.1\n"
-    )
-    cli.done("convert --batch many.toml -o here")
-    cli.done(f"convert --batch many.toml -o there --scheduler {local.client.scheduler.address}")
-    for name in ("scene.ply", "b.ply"):
-        assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
-
-
-def test_images_and_videos_are_the_same(local, cli, monkeypatch):
+def test_scenes_are_converted_and_images_and_videos_made_to_the_same_bytes(local, cli):
     def made(folder: str, **given: Any) -> list[bytes]:
         Path(folder).mkdir()
         how = {"rasterizer": "eager", "scale": 0.5, **given}
@@ -157,6 +146,14 @@ def test_images_and_videos_are_the_same(local, cli, monkeypatch):
     local.monitor.workers.clear()  # another test may have killed the one
     assert made("out", scheduler=local) == made("one")
     assert local.monitor.workers == {1}
+    Path("many.toml").write_text(
+        "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
+        "cameras = '.'\nvariance = 0.1\n"
+    )
+    cli.done("convert --batch many.toml -o here")
+    cli.done(f"convert --batch many.toml -o there --scheduler {local.client.scheduler.address}")
+    for name in ("scene.ply", "b.ply"):
+        assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
 
 
 def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local):

@@ -337,13 +337,6 @@ def test_a_format_says_what_it_loses(tmp_path: Path, expected, caplog, monkeypat
     assert f"a .{name} cannot hold {lost}; a .ply can" in record.message
 
 
-def test_the_farthest_position_of_a_spz_stays_on_its_side(tmp_path: Path):
-    scene = replace(oracle(), origin=None)
-    scene.means[3] = torch.tensor([1.0, -1.0, 1.0]) * (1024 - 2**-14)  # half a step below what the format holds
-    write_scene(tmp_path / "a.spz", scene)
-    torch.testing.assert_close(read_scene(tmp_path / "a.spz").gaussians().means, scene.means, rtol=0, atol=1e-4)
-
-
 def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):
     write_scene(tmp_path / "a.spz", expected, spz_axes="opencv")
     same = read_scene(tmp_path / "a.spz", spz_axes="opencv").gaussians()
@@ -387,6 +380,11 @@ def test_spz_holds_the_ends_of_its_ranges(tmp_path: Path, expected):
     torch.testing.assert_close(again.means, ends.means, rtol=0, atol=0.25)
     assert again.log_scales.tolist() == [[-10, 0, 5.9375], [-10, 5.9375, 0]]
     assert again.opacities.tolist() == pytest.approx([1, 0], abs=1e-6)
+    farthest = replace(expected, origin=None, means=expected.means.clone())
+    farthest.means[3] = torch.tensor([1.0, -1.0, 1.0]) * (1024 - 2**-14)  # half a step below what the format holds
+    write_scene(tmp_path / "b.spz", farthest)
+    means = read_scene(tmp_path / "b.spz").gaussians().means
+    torch.testing.assert_close(means, farthest.means, rtol=0, atol=1e-4)  # each stays on its side
 
 
 @pytest.mark.parametrize(
@@ -483,7 +481,7 @@ def test_odd_sogs_are_refused(tmp_path: Path, changes: dict[str, object], proble
     refused(sog_folder(tmp_path, **changes), problem)
 
 
-def test_spz_streams_are_held_to_their_size(tmp_path: Path):
+def test_spz_streams_are_held_to_their_size_and_a_damaged_byte_in_them_is_noticed(tmp_path: Path):
     data = bytearray((DATA / "oracle_v4.spz").read_bytes())
     for wrong in (0, 2**63, 361):
         struct.pack_into("<Q", data, 32 + 8, wrong)
@@ -492,14 +490,11 @@ def test_spz_streams_are_held_to_their_size(tmp_path: Path):
     whole = (DATA / "oracle_v4.spz").read_bytes()
     (tmp_path / "a.spz").write_bytes(whole[:-1])
     refused(tmp_path / "a.spz", f"is cut short: {len(whole):,} bytes promised, {len(whole) - 1:,} there")
-
-
-def test_a_damaged_byte_in_the_streams_of_a_spz_is_noticed(tmp_path: Path):
-    write_scene(tmp_path / "a.spz", replace(oracle(), origin=None))
-    whole = (tmp_path / "a.spz").read_bytes()
+    write_scene(tmp_path / "b.spz", replace(oracle(), origin=None))
+    whole = (tmp_path / "b.spz").read_bytes()
     for place in range(len(whole) // 2, len(whole), 37):  # beyond the header and the list of streams
-        (tmp_path / "a.spz").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        refused(tmp_path / "a.spz", r"a\.spz")
+        (tmp_path / "b.spz").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        refused(tmp_path / "b.spz", r"b\.spz")
 
 
 @pytest.mark.parametrize("level", [0, 2])
@@ -641,18 +636,14 @@ def test_real_compressed_scenes_are_read(shared_data, name: str, n: int, degree:
 def test_the_size_of_blocks_changes_nothing_that_is_written(tmp_path: Path, monkeypatch, suffix: str):
     scene = make_scene(300, degree=2)
     write_scene(tmp_path / f"whole.{suffix}", scene)
+    rows = torch.randn(1000, 24, generator=torch.Generator().manual_seed(0)) * torch.linspace(1, 5, 24)
+    along = codebooks._along(rows)
     monkeypatch.setattr("aaplug.io.scenes.codebooks.BLOCK_ROWS", 7)
     monkeypatch.setattr("aaplug.io.scenes.compressed_ply.PART", 7)
+    assert torch.equal(codebooks._along(rows), along)
     write_scene(tmp_path / f"blocks.{suffix}", scene)
     whole, blocks = (read_scene(tmp_path / f"{name}.{suffix}").gaussians() for name in ("whole", "blocks"))
     assert all(torch.equal(column, blocks.columns[name]) for name, column in whole.columns.items())
-
-
-def test_rows_lie_along_their_main_direction_whatever_the_size_of_blocks(monkeypatch):
-    rows = torch.randn(1000, 24, generator=torch.Generator().manual_seed(0)) * torch.linspace(1, 5, 24)
-    expected = codebooks._along(rows)
-    monkeypatch.setattr("aaplug.io.scenes.codebooks.BLOCK_ROWS", 7)
-    assert torch.equal(codebooks._along(rows), expected)
 
 
 COUNT = 80_000  # Gaussians of degree 3: 19 MB

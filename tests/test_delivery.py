@@ -213,14 +213,6 @@ def test_halves_and_both_axes_of_usd_are_read(tmp_path: Path, up: str):
     torch.testing.assert_close(read.gaussians().means, wanted, rtol=2e-3, atol=2e-3)
 
 
-def test_a_usd_core_that_does_not_know_splats_is_refused(tmp_path: Path, monkeypatch):
-    pytest.importorskip("pxr")
-    from aaplug.io import usd_child
-
-    monkeypatch.setattr(usd_child.UsdGeom, "Xformable", lambda prim: None)  # as of a prim without a place
-    assert "usd-core 26.3" in usd_child.found_in(str(stage(tmp_path, oracle())), {})["refused"]
-
-
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
@@ -240,7 +232,7 @@ def test_stages_of_several_files_and_odd_ones_are_refused(tmp_path: Path, change
         read_scene(stage(tmp_path, oracle(), **changes)).gaussians()
 
 
-def test_usd_scenes_without_the_package_name_the_extra(tmp_path: Path, monkeypatch):
+def test_usd_scenes_need_a_package_that_knows_them(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     with pytest.raises(UsageError, match="need the extra `usd`"):
@@ -248,6 +240,11 @@ def test_usd_scenes_without_the_package_name_the_extra(tmp_path: Path, monkeypat
     with pytest.raises(UsageError, match=r"needs pxr: .*\[usd\]"):
         write_scene(tmp_path / "b.usdz", oracle())
     assert [file.name for file in tmp_path.iterdir()] == ["a.usda"]
+    pytest.importorskip("pxr")
+    from aaplug.io import usd_child
+
+    monkeypatch.setattr(usd_child.UsdGeom, "Xformable", lambda prim: None)  # as of a prim without a place
+    assert "usd-core 26.3" in usd_child.found_in(str(stage(tmp_path, oracle())), {})["refused"]
 
 
 # Codebooks

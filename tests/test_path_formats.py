@@ -108,17 +108,14 @@ def test_supersplat_settings_are_turned_into_the_scenes_axes(tmp_path):
     assert 2 * math.degrees(math.atan(camera.width / 2 / camera.fx)) == pytest.approx(60)
 
 
-def test_supersplat_settings_of_version_1_have_one_angle_of_view(tmp_path):
+def test_supersplat_settings_of_version_1_have_one_angle_of_view_and_tracks_may_repeat(tmp_path):
     first = {key: value for key, value in SETTINGS.items() if key != "version"} | {"camera": {"fov": 90}}
     track = json.loads(json.dumps(SETTINGS["animTracks"][0]))
     del track["keyframes"]["values"]["fov"]
     path = read_camera_path(written(tmp_path, "settings.json", first | {"animTracks": [track]}))
     assert path.cameras[0].fx == pytest.approx(path.cameras[0].width / 2)
-
-
-def test_supersplat_tracks_that_repeat_go_round(tmp_path):
-    track = {**SETTINGS["animTracks"][0], "loopMode": "repeat", "duration": 3}
-    path = read_camera_path(written(tmp_path, "settings.json", {**SETTINGS, "animTracks": [track]}))
+    track |= {"loopMode": "repeat", "duration": 3}
+    path = read_camera_path(written(tmp_path, "settings.json", first | {"animTracks": [track]}))
     places = [-camera.centre[0].item() for camera in path.cameras]
     assert len(places) == 30
     assert [places[0], places[10], places[20]] == pytest.approx([0, 1, 2])

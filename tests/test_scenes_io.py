@@ -569,7 +569,7 @@ def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int
     assert sizes in refused(path, f"{whole} of 5 Gaussians are whole").replace(",", "")
 
 
-def test_more_gaussians_than_allowed_are_refused(tmp_path: Path, monkeypatch):
+def test_more_gaussians_than_allowed_or_than_memory_holds_are_refused(tmp_path: Path, monkeypatch):
     path = File().save(tmp_path)
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "5")
     assert len(read_scene(path).gaussians()) == 5
@@ -578,10 +578,7 @@ def test_more_gaussians_than_allowed_are_refused(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "many")
     with pytest.raises(UsageError, match="AAPLUG_GAUSSIANS: should be a number above 0"):
         read_scene(path).gaussians()
-
-
-def test_a_scene_larger_than_memory_is_refused_whole_and_read_in_parts(tmp_path, monkeypatch):
-    path = File().save(tmp_path)
+    monkeypatch.delenv("AAPLUG_GAUSSIANS")
     monkeypatch.setenv("AAPLUG_MEMORY_SHARE", "1e-9")
     refused(path, "info and convert read it in parts")
     assert [len(part) for part in read_scene(path).parts(size=2)] == [2, 2, 1]
