@@ -25,24 +25,17 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
+from aaplug import RASTERIZERS, Gaussians, Rasterizer, Renderer, Splats2D, TrainingViews, read_cameras, write_png
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.splats import Splats2D
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.laws.base import make_camera as make_camera
 from aaplug.evaluation.laws.base import make_scene as make_scene
 from aaplug.evaluation.laws.base import make_splats as make_splats
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import write_png
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.lab.learned import NAMES
 from aaplug.lab.pixel_size import PixelSizes
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled, on_demand
 from aaplug.rasterizers.tiled.ahead_of_time import load
-from aaplug.rendering.renderer import Renderer
 from tests import check_again
 
 COMPILED = load()

@@ -20,6 +20,7 @@ from pathlib import Path
 import jaxtyping
 import torch
 
+from aaplug import AaplugError, read_scene
 from aaplug.evaluation.coverage import survey
 from aaplug.io.scenes import read_scene
 from aaplug.system.errors import AaplugError

@@ -14,11 +14,9 @@ import numpy as np
 import torch
 from numpy.lib import recfunctions as rfn
 
+from aaplug import SH_C0, Gaussians, read_scene, write_scene
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored, placed
-from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.lcc import FAR_RECORD, Z_UP
 
 DATA = Path(__file__).resolve().parent / "data"

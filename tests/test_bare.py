@@ -9,14 +9,13 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import Camera, CameraSet, Exposure, Renderer, TrainingViews, UsageError
 from aaplug.core.camera_paths import up_of
-from aaplug.core.cameras import Camera, CameraSet, Exposure
 from aaplug.core.chunks import chunks_of
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of, orbit
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.sampling import sampling_bounds
-from aaplug.core.training import TrainingViews
 from aaplug.io.images import image_size, read_image
 from aaplug.io.scenes import SceneLike, read_scene, scene_of, write_scene
 from aaplug.levels.clusters import rates_of
@@ -26,8 +25,6 @@ from aaplug.options.base import Options
 from aaplug.options.verbs import DEFAULT_FOV, Orbit
 from aaplug.rendering.assumed import CROP_SIDE, cameras_around, decibels_at, frame_around, rate_of
 from aaplug.rendering.job import Job
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from tests.conftest import make_scene, write_model
 
 UP = (0.0, 0.0, 1.0)

@@ -17,7 +17,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraFileOptions, CameraSet, FormatError, UsageError, write_scene
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.conventions import CLASSIC, KHR
 from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
@@ -25,9 +25,6 @@ from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.inria import read_cfg_args
 from aaplug.io.cameras.photos import without_suffix
 from aaplug.io.cameras.poses import inverse
-from aaplug.io.cameras.sets import CameraFileOptions
-from aaplug.io.scenes import write_scene
-from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera, make_scene
 from tests.scene_files import with_value, write_json

@@ -145,7 +145,6 @@ REFUSED = {
     f"{LOD} -o x.obj --simplify 0.5": ["has no suffix of a format that can be written"],
     f"{TUNE} --method mipmap-gs --scale 0.5 0.25": ["one model for one scale"],
     f"{TUNE} --upsampler nearest --scale 2": ["expected bicubic, lanczos"],
-    f"{TUNE} --upsampler bicubic": ["--upsampler: is for scales above the source images', and there is none"],
     f"{TUNE} --truth photographs": ["has no photograph; --truth self"],
     f"{TUNE} --move size": ["--move: 'size' is not one of means"],
 }

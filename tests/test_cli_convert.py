@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from aaplug import Fusion, read_scene, write_scene
 from aaplug.core.conventions import MIP, PLAYCANVAS
-from aaplug.core.gaussians import Fusion
 from aaplug.evaluation.engine import evaluate
 from aaplug.finetuning.session import tuned_scene
 from aaplug.finetuning.state import between

@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 from aaplug_cli.verbs import VERBS
 
+from aaplug import RECIPES, evaluate, read_scene
 from aaplug.core.gaussians import digest_of_scene
 from aaplug.evaluation.journal import JOURNAL
 from aaplug.evaluation.report.files import COMPARED, PAGE, RESULTS
 from aaplug.io.images import image_size
-from aaplug.io.scenes import read_scene
-from aaplug.methods import RECIPES
-from aaplug.verbs.evaluate import evaluate
 
 
 def test_it_writes_results_and_prints_a_table(cli):

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.io.scenes import write_scene
-from aaplug.verbs.info import info
+from aaplug import info, write_scene
 from tests.conftest import make_scene
 from tests.test_cli import break_nan, inria_model
 

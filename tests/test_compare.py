@@ -13,15 +13,14 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import read_cameras, read_scene, write_scene
 from aaplug.core.conventions import MIP
 from aaplug.evaluation.alignment import mismatch
 from aaplug.evaluation.comparison import differences
 from aaplug.evaluation.engine import ViewMeasurer
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_sheet, error_map, labelled, magnified
-from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.system.executors import load, save
 from tests.conftest import EYES, make_scene
 from tests.scene_files import DATA, half_turn_about_x

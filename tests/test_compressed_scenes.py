@@ -17,26 +17,13 @@ import numpy as np
 import pytest
 import torch
 
+from aaplug import Scene, SceneFileOptions, WritableFormat, read_scene, write_scene
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.io.gltf import Gltf, glb_start
-from aaplug.io.scenes import (
-    HEAD_BYTES,
-    OWN,
-    SCENE_FORMATS,
-    WritableFormat,
-    codebooks,
-    find_scene,
-    ply,
-    read_scene,
-    sog,
-    usd,
-    write_scene,
-)
+from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, codebooks, find_scene, ply, sog, usd
 from aaplug.io.scenes import gltf as scene_gltf
-from aaplug.io.scenes.rows import SceneFileOptions
-from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named

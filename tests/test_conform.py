@@ -10,15 +10,12 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import AaplugError, Renderer, UsageError, read_cameras, read_image, write_png
 from aaplug.core.imaging import quantised
 from aaplug.evaluation import conformance
 from aaplug.evaluation.conformance import CAMERA, FAULTS, NONE, TESTS, Conformance, Fault, judged
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import read_image, write_png
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import AaplugError, UsageError
 from tests.conftest import ALL_RASTERIZERS
 from tests.test_gsplat import composited
 

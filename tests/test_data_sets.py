@@ -10,10 +10,9 @@ import pytest
 from PIL import Image
 
 import aaplug
+from aaplug import FormatError, UsageError, read_scene, write_scene
 from aaplug.evaluation.data_sets import DATA_SETS, PUBLISHED, Paper, find_scenes
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.scene import MODEL_SCENE as MODEL
-from aaplug.system.errors import FormatError, UsageError
 
 RUN = "evaluate data --protocol blender --recipe classic --scale 1 0.5 --rasterizer eager -o out"
 

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.gaussians import Gaussians
+from aaplug import FormatError, Gaussians, UsageError, read_scene, write_scene
 from aaplug.io.gltf import Gltf, glb_start
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.codebooks import codebook, nearest_row, nearest_value, palette
 from aaplug.io.scenes.packed import half_turn_about_z
-from aaplug.system.errors import FormatError, UsageError
 from tests.bench.delivery import checked, checked_by_usd
 from tests.scene_files import oracle, with_value, write_json
 

@@ -18,9 +18,7 @@ from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
 from PIL import Image
 
-from aaplug.core.gaussians import Gaussians
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug import Gaussians, read_cameras, read_scene, write_scene
 from aaplug.options.verbs import BUILT_IN_PATHS
 from tests.conftest import GUIDES, ROOT, SAMPLE, write_model
 

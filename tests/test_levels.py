@@ -11,14 +11,11 @@ import torch
 
 import aaplug
 import aaplug.core.projection
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, Gaussians, Renderer, Scene, cameras_around, read_scene
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project, quats_of, rotation_matrices
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.scene import Scene
 from aaplug.levels import pairing
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, pair_moments, rates_of
 from aaplug.levels.covariances import area, areas, blur, covariances, overlaps
@@ -26,8 +23,6 @@ from aaplug.levels.merging import TOLERANCE, Goal, merge
 from aaplug.levels.pairing import ALPHA_WEIGHT, MAX_COST, PIXEL_BLUR, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
-from aaplug.rendering.assumed import cameras_around
-from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.io.cameras import read_camera_path, read_cameras
+from aaplug import AaplugError, FormatError, UsageError, read_camera_path, read_cameras
 from aaplug.io.gltf import glb_start
-from aaplug.system.errors import AaplugError, FormatError, UsageError
 from tests.scene_files import with_value
 from tests.test_cameras_io import FIXTURES
 

@@ -18,14 +18,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
+from aaplug import Monitor, merge
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
 from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene, written_format
 from aaplug.io.scenes.ply import EXTRAS
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
-from aaplug.system.monitor import Monitor
-from aaplug.verbs.merge import merge
 from tests.conftest import make_scene
 
 QUICK = 0.5  # s, for a refusal

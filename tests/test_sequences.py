@@ -6,14 +6,10 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, FormatError, Renderer, UsageError, read_image, read_scene, write_scene
 from aaplug.core.conventions import MIP
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.results import tables
-from aaplug.io.images import read_image
-from aaplug.io.scenes import read_scene, write_scene
-from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import FormatError, UsageError
 from tests.bench.sequences import turning, write_sequence
 from tests.conftest import make_camera, make_scene
 

@@ -14,14 +14,13 @@ import pytest
 import torch
 
 import aaplug
+from aaplug import SH_C0, VIEWERS
 from aaplug.core.camera_paths import up_of
 from aaplug.core.orbits import frame_of
 from aaplug.core.sampling import median_rates
-from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io import rad, streamed
 from aaplug.io.scenes import pyramid_folder, read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
-from aaplug.methods.viewers import VIEWERS
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 

@@ -10,19 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
+from aaplug import CameraSet, Pyramid, Renderer, read_image, write_png
 from aaplug.core.imaging import average_samples, box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, PINHOLE, opencv_lens
-from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.images import read_image, write_png
 from aaplug.live import pictures
 from aaplug.live.messages import PickRequest, PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
 from aaplug.live.pictures import Page, Pictures
 from aaplug.live.subject import Subject
 from aaplug.methods.recipe import LevelChoice
-from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
 from tests.conftest import make_camera, make_scene, with_photographs
 

@@ -13,14 +13,10 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
+from aaplug import Renderer, read_camera_path, read_image, serving, write_scene
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.cameras import read_camera_path
-from aaplug.io.images import read_image
-from aaplug.io.scenes import write_scene
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.view import serving
 from tests.conftest import click, make_camera, make_scene
 from tests.test_view import decoded, with_photograph
 

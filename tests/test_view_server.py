@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
+from aaplug import AaplugError, UsageError, serving, view
 from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.live.pictures import Page
 from aaplug.live.subject import Subject
@@ -22,7 +23,6 @@ from aaplug.system.errors import AaplugError, UsageError
 from aaplug.system.executors import given_threads, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.locks import LOCK_FILE_NAME, SCRATCH_PREFIX
-from aaplug.verbs.view import serving, view
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
 
 POSE = torch.eye(4).flatten().tolist()

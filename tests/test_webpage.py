@@ -17,17 +17,13 @@ import pytest
 import torch
 from markupsafe import escape
 
-from aaplug.core.cameras import CameraSet
-from aaplug.core.training import TrainingViews
+from aaplug import CameraSet, Renderer, TrainingViews, compare, evaluate
 from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.report import webpage
 from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size
 from aaplug.io.streamed import STREAMS
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.compare import compare
-from aaplug.verbs.evaluate import evaluate
 from tests.conftest import click, make_camera, make_scene, with_photographs
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"

@@ -11,12 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug import COLOUR_OFFSET, SH_C0, Camera, CameraSet, Renderer, look_at
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.imaging import box_average
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
-from aaplug.rendering.renderer import Renderer
 
 WIDTHS = (0.5, 1.0, 2.0, 3.0, 4.0)  # px
 CELL = 8  # px, of the checkerboard
