@@ -348,6 +348,12 @@ def cameras() -> list[Camera]:
     return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(eyes)]
 
 
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    """Every column of both is equal to the bit."""
+    for name, column in a.columns.items():
+        assert torch.equal(column, b.columns[name]), name
+
+
 def moved(camera: Camera, offset: Iterable[float]) -> Camera:
     """The camera moved by an offset in the world."""
     pose = camera.cam_from_world.clone()

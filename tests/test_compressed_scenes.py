@@ -19,7 +19,7 @@ import torch
 
 from aaplug import Scene, SceneFileOptions, WritableFormat, read_scene, write_scene
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
-from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
+from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians, joined
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.io.gltf import Gltf, glb_start
 from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, codebooks, find_scene, ply, sog, usd
@@ -27,7 +27,7 @@ from aaplug.io.scenes import gltf as scene_gltf
 from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
-from tests.conftest import SAMPLE, make_scene, memory_taken, needs_peak_memory
+from tests.conftest import SAMPLE, assert_equal, make_scene, memory_taken, needs_peak_memory
 from tests.scene_files import DATA, MADE, STORED, ksplat, oracle, splat, splats, write_file, write_json
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
@@ -129,9 +129,8 @@ def test_each_format_gives_the_scene_within_its_steps(tmp_path: Path, expected, 
     write_scene(tmp_path / "out.ply", scene)
     again = read_scene(tmp_path / "out.ply").gaussians()
     assert again.convention == scene.convention
-    for field, column in scene.columns.items():
-        assert torch.equal(torch.cat([part.columns[field] for part in parts]), column)
-        assert torch.equal(again.columns[field], column)
+    for same in (joined(parts), again):
+        assert_equal(scene, same)
 
 
 @pytest.mark.parametrize(
@@ -629,8 +628,7 @@ def test_the_size_of_blocks_changes_nothing_that_is_written(tmp_path: Path, monk
     monkeypatch.setattr("aaplug.io.scenes.compressed_ply.PART", 7)
     assert torch.equal(codebooks._along(rows), along)
     write_scene(tmp_path / f"blocks.{suffix}", scene)
-    whole, blocks = (read_scene(tmp_path / f"{name}.{suffix}").gaussians() for name in ("whole", "blocks"))
-    assert all(torch.equal(column, blocks.columns[name]) for name, column in whole.columns.items())
+    assert_equal(*(read_scene(tmp_path / f"{name}.{suffix}").gaussians() for name in ("whole", "blocks")))
 
 
 COUNT = 80_000  # Gaussians of degree 3: 19 MB

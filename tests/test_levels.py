@@ -25,7 +25,7 @@ from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
-from tests.conftest import make_camera, make_scene
+from tests.conftest import assert_equal, make_camera, make_scene
 from tests.wires import contrast, wires_over_checkerboard
 
 RATE = 20.0  # px per world unit
@@ -131,11 +131,6 @@ def test_equal_gaussians_are_merged_too():
     assert len(pairs) > 60
     assert len(set(pairs.one.tolist()) | set(pairs.other.tolist())) == 2 * len(pairs)
     assert len(merged_to(3, scene)) == 3
-
-
-def assert_equal(a: Gaussians, b: Gaussians) -> None:
-    for name, column in a.columns.items():
-        assert torch.equal(column, b.columns[name]), name
 
 
 def test_the_order_of_the_scene_plays_no_part():

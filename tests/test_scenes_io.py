@@ -25,7 +25,7 @@ from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene, w
 from aaplug.io.scenes.ply import EXTRAS
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
-from tests.conftest import make_scene
+from tests.conftest import assert_equal, make_scene
 
 QUICK = 0.5  # s, for a refusal
 NUMPY = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "short": "<i2", "int32": "<i4"}
@@ -152,11 +152,6 @@ def values(content: bytes, file: File) -> np.ndarray:
     return np.frombuffer(content.split(b"end_header\n")[1], dtype)
 
 
-def same_values(a: Gaussians, b: Gaussians) -> bool:
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
-
-
 def refused(path: Path, problem: str) -> str:
     with pytest.raises(FormatError, match=problem) as caught:
         read_scene(path).gaussians()
@@ -184,7 +179,7 @@ def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data)
     scene = replace(scene, convention=convention, fused=fused, filter_3d=filter_3d)
     content = through(scene, folder)
     again = read_scene(folder / "out.ply").gaussians()
-    assert same_values(again, scene)
+    assert_equal(again, scene)
     assert (again.convention, again.fused) == (convention, fused)
     assert (again.filter_3d is None) == (filter_3d is None)
     assert comments(content).count("SplatRenderMode: mip") == convention.compensated
@@ -238,7 +233,7 @@ def test_what_only_a_ply_keeps_is_named(tmp_path: Path, caplog, monkeypatch):
 def test_large_scenes_are_copied_in_whole(tmp_path: Path):
     scene = make_scene(70_000, degree=0)
     write_scene(tmp_path / "large.ply", scene)
-    assert same_values(read_scene(tmp_path / "large.ply").gaussians(), scene)
+    assert_equal(read_scene(tmp_path / "large.ply").gaussians(), scene)
 
 
 @pytest.mark.data
@@ -376,7 +371,7 @@ def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: st
     path = coded(tmp_path, file, order)
     path.write_bytes(path.read_bytes().replace(b"element", "\ncomment 日本\nelement".encode(), 1))
     scene, twin = read_scene(path).gaussians(), read_scene(tmp_path / "in.ply").gaussians()
-    assert same_values(scene, twin)
+    assert_equal(scene, twin)
     header, rows = through(scene, tmp_path).split(b"end_header\n", 1)
     assert "\ncomment 日本\n".encode() in header
     assert b"\n\n" not in header
@@ -487,7 +482,7 @@ def test_parts_make_the_whole(tmp_path: Path, file: File):
     opened = read_scene(file.save(tmp_path))
     parts = list(opened.parts(size=2))
     assert [len(part) for part in parts] == [2, 2, 1]
-    assert same_values(parts[1], opened.gaussians()[2:4])
+    assert_equal(parts[1], opened.gaussians()[2:4])
     write_parts(tmp_path / "out.ply", iter(parts), 5)
     assert (tmp_path / "out.ply").read_bytes() == file.content
 

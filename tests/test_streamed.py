@@ -22,7 +22,7 @@ from aaplug.io import rad, streamed
 from aaplug.io.scenes import pyramid_folder, read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
 from aaplug.system.errors import FormatError, OutputError, UsageError
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, moved
 
 LEVELS = 2
 HOW = {"levels": LEVELS, "refine": False, "min_seen": 0.0}
@@ -42,15 +42,9 @@ def made(folder, to, scene=SCENE, cameras=CAMERAS, **how):
     return aaplug.lod(scene, cameras, folder, to=to, **HOW | how)
 
 
-def moved(cameras, by):
+def all_moved(cameras, by):
     """The cameras in the place of a scene that was moved."""
-
-    def placed(camera):
-        pose = camera.cam_from_world.double().clone()
-        pose[:3, 3] -= pose[:3, :3] @ by
-        return replace(camera, cam_from_world=pose)
-
-    return replace(cameras, train=tuple(map(placed, cameras.train)))
+    return replace(cameras, train=tuple(moved(camera, by) for camera in cameras.train))
 
 
 def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
@@ -90,7 +84,7 @@ def test_a_complete_stream_is_refused_and_complete_only_for_as_many_levels(tmp_p
 def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves, far):
     """By the specification: an error over distance in px, and a child's box and error within its parent's."""
     whole = FAR_SCENE if far else SCENE
-    levels = made(tmp_path / "out", "3dtiles", whole, moved(CAMERAS, UTM * far))
+    levels = made(tmp_path / "out", "3dtiles", whole, all_moved(CAMERAS, UTM * far))
     index = json.loads((tmp_path / "out" / "tileset.json").read_text())
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert (index["asset"]["version"], required) == ("1.1", streamed.SPLATS)
@@ -125,7 +119,7 @@ def test_a_viewer_without_transforms_is_told_to_move_far_gaussians(tmp_path, cap
     streamed.check_positions(tmp_path, to, replace(SCENE, log_scales=SCENE.log_scales - 20))
     made(tmp_path / "near", to)
     assert not caplog.messages, "moving would not help"
-    made(tmp_path / "far", to, FAR_SCENE, moved(CAMERAS, UTM))
+    made(tmp_path / "far", to, FAR_SCENE, all_moved(CAMERAS, UTM))
     said = "of 200 Gaussians by more than their size, so far from the origin; move the scene by aaplug merge, or write "
     assert re.fullmatch(rf"{tmp_path / 'far'}: {viewer} moves \d+ {said}3dtiles", caplog.messages[0])
 
