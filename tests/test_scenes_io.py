@@ -27,7 +27,7 @@ from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import assert_equal, make_scene
 
-QUICK = 0.5  # s, for a refusal
+QUICK = 0.5  # s of processor time, for a refusal: others may make the clock run longer
 NUMPY = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "short": "<i2", "int32": "<i4"}
 
 
@@ -548,9 +548,9 @@ BAD_HEADERS = {
 @pytest.mark.parametrize(("file", "problem"), BAD_HEADERS.values(), ids=BAD_HEADERS.keys())
 def test_bad_headers_are_one_quick_line(tmp_path: Path, file: File, problem: str):
     path = file.save(tmp_path)
-    start = time.perf_counter()
+    start = time.process_time()
     said = refused(path, problem)
-    assert time.perf_counter() - start < QUICK
+    assert time.process_time() - start < QUICK
     assert "\n" not in said
     assert said.startswith(str(path))
 
