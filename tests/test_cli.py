@@ -147,6 +147,7 @@ REFUSED = {
     f"{TUNE} --upsampler nearest --scale 2": ["expected bicubic, lanczos"],
     f"{TUNE} --truth photographs": ["has no photograph; --truth self"],
     f"{TUNE} --move size": ["--move: 'size' is not one of means"],
+    f"{TUNE} --overwrite -o scene.ply": ["is also the input"],
 }
 
 
