@@ -22,8 +22,6 @@ import torch
 
 from aaplug import AaplugError, read_scene
 from aaplug.evaluation.coverage import survey
-from aaplug.io.scenes import read_scene
-from aaplug.system.errors import AaplugError
 from tests.scene_files import DATA, MADE, SEVERAL, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer

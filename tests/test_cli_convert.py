@@ -12,7 +12,6 @@ from aaplug.core.conventions import MIP, PLAYCANVAS
 from aaplug.evaluation.engine import evaluate
 from aaplug.finetuning.session import tuned_scene
 from aaplug.finetuning.state import between
-from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 
 CONVERT = "convert scene.ply --cameras . -o c.ply"

@@ -19,7 +19,6 @@ from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.live.pictures import Page
 from aaplug.live.subject import Subject
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import AaplugError, UsageError
 from aaplug.system.executors import given_threads, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.locks import LOCK_FILE_NAME, SCRATCH_PREFIX
