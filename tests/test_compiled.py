@@ -402,6 +402,29 @@ def test_a_cache_that_may_not_be_looked_into_is_an_empty_one(empty_cache, monkey
     assert not compiled.is_built(binning.PAIRS)
 
 
+def test_without_a_home_images_are_eager_and_one_line_says_what_to_set(monkeypatch, caplog):
+    """As for an account that the system does not know."""
+    pwd = pytest.importorskip("pwd")
+    monkeypatch.setattr(pwd, "getpwuid", Mock(side_effect=KeyError))
+    for variable in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    compiled._warn.cache_clear()
+    assert find_rasterizer("auto") is RASTERIZERS["eager"]
+    [line] = caplog.messages
+    assert line.startswith("HOME: names no folder to keep kernels in; set it, or XDG_CACHE_HOME; images are drawn")
+    assert not compiled.is_built(binning.PAIRS)
+    with pytest.raises(UsageError, match="HOME: names no folder"):
+        compiled.build()
+
+
+@pytest.mark.skipif(not hasattr(os, "ST_NOEXEC"), reason="this system does not tell")
+def test_nothing_is_compiled_into_a_folder_that_no_program_runs_from(compiling, empty_cache, monkeypatch):
+    compiling(Mock(side_effect=AssertionError))
+    monkeypatch.setattr(os, "statvfs", lambda path: Mock(f_flag=os.ST_NOEXEC))
+    with pytest.raises(UsageError, match=rf"{empty_cache}/kernels is mounted without execution .* XDG_CACHE_HOME"):
+        compiled.build()
+
+
 PIXELS_AND_SELECTIONS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
 IMAGES = [(name, 1) for name in PIXELS_AND_SELECTIONS.values()] + [("matched", degree) for degree in (0, 2, 3)]
 

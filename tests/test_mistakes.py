@@ -73,6 +73,16 @@ def test_a_folder_of_results_is_refused_before_anything_is_read(cli, words):
     assert (code, err.count("\n"), "--overwrite starts anew" in err) == (2, 1, True)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a folder that a program works in cannot be removed there")
+def test_a_folder_that_was_removed(cli):
+    data, gone = Path().absolute(), Path("gone").absolute()
+    gone.mkdir()
+    os.chdir(gone)
+    gone.rmdir()
+    words = f"render {data}/scene.ply --cameras {data} -o {data}/out"
+    cli.refused(words, "current folder: cannot be used: no such file")
+
+
 def test_names_that_are_not_utf_8(cli, plots_drawn_once):
     odd = os.fsdecode(b"\xff\xfe")
     Path("scene.ply").rename(f"{odd}.ply")

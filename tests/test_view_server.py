@@ -1,8 +1,10 @@
 """The live view's server: what a page may ask for, who is let in, and the command."""
 
 import asyncio
+import errno
 import json
 import math
+import os
 import re
 import socket
 import webbrowser
@@ -153,6 +155,16 @@ def test_a_network_address_asks_for_its_token(seen):  # noqa: F811
         refused(bare)
         with connected(local) as connection:
             assert json.loads(connection.recv())["views"]
+
+
+def test_a_server_that_cannot_begin_lets_nobody_wait(seen, monkeypatch):  # noqa: F811
+    def run(serve):
+        serve.close()
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(asyncio, "run", run)
+    with pytest.raises(UsageError, match="cannot be used: too many open files"), serving(*seen, port=0):
+        pass
 
 
 class FakePage(Page):

@@ -60,7 +60,7 @@ class Server:
         self._open_pages = 0
         self._started: Future[tuple[asyncio.AbstractEventLoop, int]] = Future()  # with its loop and port
         self._end = asyncio.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="server", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
 
     @property
     def address(self) -> str:
@@ -75,7 +75,7 @@ class Server:
         self._thread.start()
         try:
             self._loop, self._port = self._started.result()
-        except (OSError, UnicodeError) as error:
+        except (OSError, UnicodeError) as error:  # the latter: no host can have this name
             self._thread.join()
             code = None if isinstance(error, socket.gaierror | UnicodeError) else error.errno
             why = strerror(code).lower() if code else reason(error)  # asyncio's own words name the address once more
@@ -89,15 +89,18 @@ class Server:
         self._thread.join()
         self._drawing.shutdown()
 
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except Exception as error:
+            if self._started.done():
+                raise
+            self._started.set_exception(error)  # whoever started it waits
+
     async def _serve(self) -> None:
         limits = {"max_size": MAX_MESSAGE_BYTES, "max_queue": 16, "compression": None}
         options = limits | {"process_request": self._answer, "logger": log, "server_header": None}
-        try:
-            listener = await serve(self._talk, self._host, self._port, **options)
-        except (OSError, UnicodeError) as error:  # the latter: no host can have this name
-            self._started.set_exception(error)
-            return
-        async with listener:
+        async with await serve(self._talk, self._host, self._port, **options) as listener:
             self._started.set_result((asyncio.get_running_loop(), listener.sockets[0].getsockname()[1]))
             await self._end.wait()
 

@@ -176,8 +176,12 @@ def kernels_of(recipes: Sequence[Recipe], gradients: bool = True) -> list[Kernel
 
 
 def cache_folder() -> Path:
-    """The folder of all packages."""
-    return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / "kernels"
+    """The folder of all packages; raises UsageError if this user has no home."""
+    try:
+        return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)).expanduser() / "kernels"
+    except RuntimeError as error:
+        problem = "names no folder to keep kernels in; set it, or XDG_CACHE_HOME"
+        raise UsageError("HOME", problem) from error
 
 
 def package_path(kernel: Kernel) -> Path:
@@ -212,7 +216,9 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
 
 def is_built(kernel: Kernel) -> bool:
     """True if a package of this kernel, sound or not, is in the cache."""
-    return isfile(package_path(kernel))
+    with suppress(UsageError):  # there is no cache
+        return isfile(package_path(kernel))
+    return False
 
 
 def has_compiler() -> bool:
@@ -326,6 +332,7 @@ def _build_all(
     if left:
         if not has_compiler():
             raise UsageError("warmup", f"needs a C++ compiler for torch: {_compiler()} is not here; CXX names another")
+        _check_execution(cache_folder())
         processes = min(given_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, ordered=False)
         problems: dict[str, str] = {}
@@ -347,19 +354,31 @@ def _build_all(
             raise UsageError("warmup", f"torch {torch.__version__} cannot compile {names} here: {problem}")
 
 
+def _check_execution(folder: Path) -> None:
+    """Refuse a cache from which the system loads no library, before minutes of compiling."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        refused = hasattr(os, "ST_NOEXEC") and os.statvfs(folder).f_flag & os.ST_NOEXEC  # Linux tells
+    except OSError as error:
+        raise UsageError("warmup", f"cannot write {folder}: {reason(error)}") from error
+    if refused:
+        raise UsageError("warmup", f"{folder} is mounted without execution (noexec); XDG_CACHE_HOME names another")
+
+
 @cache
-def _warn(path: Path, problem: str) -> None:
-    log.warning("%s: %s; images are drawn eagerly, and slower; `aaplug warmup` builds it again", path, problem)
+def _warn(where: str, problem: str) -> None:
+    log.warning("%s: %s; images are drawn eagerly, and slower; `aaplug warmup` builds it again", where, problem)
 
 
 def package_of(kernel: Kernel) -> Package | None:
     """The package of a kernel; None if it is not built or, with a warning, if it cannot be used."""
-    path = package_path(kernel)
+    path = None
     try:
+        path = package_path(kernel)
         return Package.of(_compared(kernel, path), kernel)
     except UsageError as error:
-        if isfile(path):
-            _warn(path, error.problem)
+        if path is None or isfile(path):
+            _warn(str(path or error.where), error.problem)
         return None
 
 
