@@ -15,6 +15,7 @@ from aaplug.system.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 GAP = 2  # characters between the columns of a table
+MAX_COLUMNS = 10_000  # characters of a line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,12 +32,16 @@ def log() -> "Console":
 def show(things: Iterable[Any]) -> None:
     """Print tables and lines of text on stdout."""
     from rich.console import Console
+    from rich.measure import Measurement
 
     for each in things:
         if isinstance(each, str):
             print(printable(each))
             continue
         console = Console(highlight=False)
+        if any(column.no_wrap for column in each.columns):  # numbers, of which rich leaves digits out to fit
+            least = Measurement.get(console, console.options.update(width=MAX_COLUMNS), each).minimum
+            console.width = max(console.width, least)
         with console.capture() as drawn:  # rich would end the program where the reader of stdout has gone
             console.print(each)
         print(drawn.get(), end="")

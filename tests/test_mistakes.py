@@ -10,11 +10,12 @@ from unittest.mock import Mock
 
 import pytest
 from aaplug_cli import console
-from aaplug_cli.console import TERMINAL, refuse, table
+from aaplug_cli.console import TERMINAL, refuse, show, table
 from aaplug_cli.main import main
 from rich.console import Console
 
 from aaplug import read_cameras, write_scene
+from aaplug.evaluation.results import Report, grid
 from aaplug.system.errors import FormatError, printable
 from aaplug.verbs.batch import status_table
 from tests.conftest import exit_code, make_scene
@@ -149,6 +150,15 @@ def test_a_name_is_no_markup_field_or_command_of_the_terminal(monkeypatch, name)
     shown = [part + printable(name) for part in ("evaluating ", "error: scene ", "row ", "cell ")]
     assert [part for part in shown if not re.search(re.escape(part) + r"(?!\\)", written.getvalue())] == []
     assert "\x1b[31m" not in written.getvalue()
+
+
+def test_numbers_are_whole_where_they_do_not_fit_side_by_side(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    scales = [1 / n for n in range(1, 13)]
+    cells = [f"{41 + scale:.4f}" for scale in scales]
+    report = Mock(Report, row_title="recipe", scales=scales, recipes=["playcanvas-classic"])
+    show([grid("PSNR", report, [cells])])
+    assert {*cells, "playcanvas-classic"} <= {*capsys.readouterr().out.split()}
 
 
 def test_a_rate_of_progress_is_in_plain_digits(capsys):
