@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from threading import Lock
+from threading import Lock, Thread
 from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -314,6 +314,12 @@ def test_lack_of_memory_is_one_clear_error(error):
         raise error
     with pytest.raises(RuntimeError, match="shape"), within_memory("view r_0"):
         raise RuntimeError("shape '[2]' is invalid for input of size 3")
+
+
+def test_lack_of_threads_is_one_clear_error(monkeypatch):
+    monkeypatch.setattr(Thread, "start", Mock(side_effect=RuntimeError("can't start new thread")))
+    with pytest.raises(UsageError, match="threads: the system starts no more; `ulimit -u`"), within_memory("memory"):
+        list(Threads(2).map(abs, [1]))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

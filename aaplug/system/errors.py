@@ -21,6 +21,7 @@ SPACE = "Zs"  # Unicode's category of spaces, such as the ideographic one
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"
 # In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
 MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
+NO_THREAD = "can't start new thread"  # Python's words for a lack of threads
 FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)  # what a full disk is, or a limit on files
 
 
@@ -136,17 +137,17 @@ def of_system(error: BaseException | None) -> OSError | None:
 
 
 def is_lack_of_memory(error: BaseException) -> bool:
-    """True if an error is Python's or torch's for lack of memory."""
+    """True if an error is Python's or torch's for lack of memory, or of threads."""
     words = str(error) if isinstance(error, RuntimeError) else ""
-    return isinstance(error, MemoryError) or any(each in words for each in MEMORY_WORDS)
+    return isinstance(error, MemoryError) or any(each in words for each in (*MEMORY_WORDS, NO_THREAD))
 
 
 @contextmanager
 def within_memory(what: str) -> Iterator[None]:
-    """Turn an error for lack of memory inside the block, Python's or torch's, into one of ours.
+    """Turn an error for lack of memory or threads inside the block, Python's or torch's, into one of ours.
 
     Raises:
-        UsageError: `what` needs more memory than the system gave.
+        UsageError: `what` needs more memory, or more threads, than the system gave.
     """
     try:
         yield
@@ -154,4 +155,6 @@ def within_memory(what: str) -> Iterator[None]:
         if not is_lack_of_memory(error):
             raise
         problem = "out of memory; a smaller `scale`, fewer `threads` or fewer Gaussians need less"
+        if NO_THREAD in str(error):
+            what, problem = "threads", "the system starts no more; `ulimit -u` or the container limits their number"
         raise UsageError(what, problem) from error
