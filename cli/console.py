@@ -33,13 +33,15 @@ def show(things: Iterable[Any]) -> None:
     """Print tables and lines of text on stdout."""
     from rich.console import Console
     from rich.measure import Measurement
+    from rich.table import Table
 
     for each in things:
         if isinstance(each, str):
             print(printable(each))
             continue
         console = Console(highlight=False)
-        if any(column.no_wrap for column in each.columns):  # numbers, of which rich leaves digits out to fit
+        if isinstance(each, Table) and any(column.no_wrap for column in each.columns):
+            # these are numbers, of which rich leaves digits out to fit
             least = Measurement.get(console, console.options.update(width=MAX_COLUMNS), each).minimum
             console.width = max(console.width, least)
         with console.capture() as drawn:  # rich would end the program where the reader of stdout has gone
