@@ -15,6 +15,7 @@ from aaplug.system.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 GAP = 2  # characters between the columns of a table
+MIN_COLUMNS = 8  # of a terminal that knows its width; with fewer, help is never done
 MAX_COLUMNS = 10_000  # characters of a line
 
 if TYPE_CHECKING:
@@ -97,7 +98,8 @@ class _Warnings(logging.Handler):
 
 def set_up() -> None:
     """Send the library's warnings to the log, and write names that are not UTF-8 in escaped form."""
-    if os.environ.get("COLUMNS") == "0":  # of terminals that do not know; rich would print nothing
+    columns = os.environ.get("COLUMNS", "")
+    if columns.isdecimal() and int(columns) < MIN_COLUMNS:
         del os.environ["COLUMNS"]
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):

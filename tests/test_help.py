@@ -122,7 +122,7 @@ def test_the_table_of_recipes_has_every_one_and_marks_those_for_comparison(cli, 
     assert [each["name"] for each in facts if not each["comparison"]] == names_of("recipe", comparisons=False)
 
 
-@pytest.mark.parametrize("columns", ["60", "0"])  # 0: a terminal that does not know
+@pytest.mark.parametrize("columns", ["60", "0", "7"])  # 0 and 7: terminals that do not know
 def test_no_table_cuts_a_name_off(cli, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", columns)
     shown = cli("recipes")[1]
