@@ -57,7 +57,7 @@ from aaplug.system.plug_ins import asked, blaming, check_answer, filtered
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 KEPT_RATES = 1 << 12  # free cameras whose rates a renderer remembers
-LIGHT_SCALE = 1 / 4  # of the view in which the light of an exposure's splats is looked up
+LIGHT_PIXELS = 1 << 16  # of the view in which the light of an exposure's splats is looked up; fewer take no less time
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -465,7 +465,8 @@ class Renderer:
         [middle] = sample_cameras(replace(fine, exposure=replace(fine.exposure, samples=1)))
         small = replace(middle, exposure=fine.exposure)
         if self.cutter is None:  # else a small view would show coarser levels of detail
-            small, samples = small.scaled(LIGHT_SCALE / samples), 1
+            small = small.scaled(min(1 / samples, math.sqrt(LIGHT_PIXELS / (small.width * small.height))))
+            samples = 1
         splats, paint = self.splats(replace(small, exposure=None), samples), partial(self.paint, hw=small.hw)
         found = lights(splats, small, self.training.convention.rules.min_alpha, partial(paint, background=BLACK))
         beside = float(found.mean().nan_to_num(1.0))
