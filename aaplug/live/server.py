@@ -39,6 +39,7 @@ from aaplug.system.locks import scratch
 
 WEBSOCKET_PATH = "/live"
 MAX_OPEN_PAGES = 32
+CLOSE_SECONDS = 1.0  # for a page's last word at the server's end; a page that sleeps has none
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 log = logging.getLogger("aaplug.live")
 log.addHandler(logging.NullHandler())
@@ -98,7 +99,7 @@ class Server:
             self._started.set_exception(error)  # whoever started it waits
 
     async def _serve(self) -> None:
-        limits = {"max_size": MAX_MESSAGE_BYTES, "max_queue": 16, "compression": None}
+        limits = {"max_size": MAX_MESSAGE_BYTES, "max_queue": 16, "compression": None, "close_timeout": CLOSE_SECONDS}
         options = limits | {"process_request": self._answer, "logger": log, "server_header": None}
         async with await serve(self._talk, self._host, self._port, **options) as listener:
             self._started.set_result((asyncio.get_running_loop(), listener.sockets[0].getsockname()[1]))
