@@ -48,10 +48,10 @@ def sample_cameras(camera: Camera) -> Iterator[Camera]:
 def spread_out(
     splats: Splats2D, camera: Camera, light: Float[Tensor, " m"] | None = None
 ) -> tuple[Splats2D, Float[Tensor, " m"]]:
-    """Splats convolved with their path across a sample's cell, and their opacities before `FAINT` ones are left out.
+    """Splats convolved with their path across a sample's cell, less some faint ones; and the opacities of all of them.
 
-    light: what the opacity of a splat is multiplied by that is spread without end; None for 1.  That of one that keeps
-        the share r of its height is multiplied by light^(1 - r).
+    light: factors of opacity for splats that are spread without end, None for 1; see `rendering.light`.  For one that
+        keeps the share r of its height it is light^(1 - r).
     """
     wide = splats.convolved(CELL_SHARE * cells(splats, camera), compensate=True, floor=0.0)
     if light is not None:

@@ -22,8 +22,8 @@ from aaplug.core.cameras import Camera
 from aaplug.core.exposures import spread_out
 from aaplug.core.splats import Render, Splats2D
 
-# Measured: of a hidden splat's light, the share that others of N samples see at least, over the cube root of N; and of
-# the cover by other splats, what counts at most, because the edge of a surface lets more pass than its middle.
+# Measured: the least share of a splat's light that counts as seen, from one of the N samples or another, over the cube
+# root of N; and the most of the cover by other splats that counts: surfaces have edges, which let more pass.
 LEAST_SEEN, MOST_COVER = 0.05, 0.8
 
 Paint = Callable[[Splats2D], Render]  # draws splats over black
@@ -50,9 +50,9 @@ def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Pa
 
 
 def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
-    """What the opacity of each splat of a sharp view is multiplied by where the camera's exposure spreads it.
+    """Factors of opacity for the splats of a sharp view, if the camera's exposure spreads them without end.
 
-    It is for one that is spread without end; see `spread_out`.
+    `spread_out` takes less of them for a splat that is spread less.
     """
     assert camera.exposure is not None
     least = LEAST_SEEN * camera.exposure.samples ** (1 / 3)

@@ -423,7 +423,7 @@ class Renderer:
         Without gradients, Gaussians pass in chunks, and memory is bounded by a chunk and by the splats that stay.
 
         samples: along a pixel's side, if `camera` is that of the supersampled image.
-        light: of the Gaussians, where its exposure spreads them, see `lights`; None: what each has alone.
+        light: factors of the Gaussians' opacities where its exposure spreads them, see `lights`; None for 1.
         """
         cut = None if self.cutter is None else self.cutter(camera, self.coarsening(camera, samples))
         whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []
@@ -455,7 +455,7 @@ class Renderer:
     @torch.inference_mode(False)
     @torch.no_grad()
     def _light(self, fine: Camera, samples: int) -> Float[Tensor, " n"] | None:
-        """What the opacity of each Gaussian is multiplied by where the exposure of a view spreads it; see `lights`.
+        """The factor of each Gaussian's opacity where the exposure of a view spreads it; see `lights`.
 
         It is looked up in a small view of the exposure's middle; Gaussians beside it have the mean.  A compositor has a
         rule of its own for what a splat hides, and does without.
