@@ -275,7 +275,7 @@ def test_a_journal_that_was_edited_by_hand_is_refused(look, views, tmp_path):
         damaged.append(json.dumps(line))
     for line in damaged:
         path.write_text("\n".join([*kept, line, ""]))
-        with pytest.raises(FormatError, match="its line 3 is damaged; remove the file to start again"):
+        with pytest.raises(FormatError, match="3 is damaged, or of another aaplug; remove the file to start again"):
             evaluate(work, journal=path, resume=True)
 
 

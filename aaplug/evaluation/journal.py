@@ -92,7 +92,7 @@ class Journal:
             for number, line in enumerate(lines[1:], start=2):
                 whole = isinstance(line, dict) and line.pop(HASH, None) == digest_of_values(line)
                 if not whole or line["view"] in self.views:
-                    raise FormatError(path, f"its line {number} is damaged; {ANEW}")
+                    raise FormatError(path, f"its line {number} is damaged, or of another aaplug; {ANEW}")
                 self.views[line["view"]] = tuple(Measurement(**each) for each in line["measurements"])
             stack.pop_all()  # the stream stays open
             self._stream = stream
