@@ -40,6 +40,14 @@ def test_a_lattice_has_one_point_in_each_part_of_each_axis(count):
     assert points.mean(dim=0).tolist() == pytest.approx([0.5] * 5)
 
 
+@pytest.mark.parametrize("count", [5, 13, 16, 17, 31, 61, 64, 101, 128, 256])
+def test_no_two_points_of_a_lattice_are_close_in_the_opening(count):
+    """In the square, whose sides are joined, a grid's least distance is 1 / √count."""
+    places = lattice(count)[:, 2:4]
+    offsets = (places[1:] - places[0] + 0.5) % 1 - 0.5  # a lattice looks the same from each point
+    assert float(offsets.norm(dim=1).min()) > 0.6 / math.sqrt(count)
+
+
 @pytest.mark.parametrize("blades", [0, 3, 4, 5, 6, 9])
 def test_places_fill_the_opening_evenly(blades):
     aperture = Aperture(2.0, 1.0, blades)
