@@ -33,7 +33,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rasterizers import RASTERIZERS, choice
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages, sources
+from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, order, packages, sources
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.system.executors import torch_threads
@@ -84,7 +84,7 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
-COMPOSITING = [kernel for kernel in ALL_KERNELS if kernel.name.startswith(("composite-", "gaussian-"))]
+COMPOSITING = [kernel for kernel in ALL_KERNELS if kernel.name.startswith(("composite-", "gaussian-", "order-"))]
 
 
 @pytest.mark.parametrize("kernel", COMPOSITING, ids=lambda kernel: kernel.name)
@@ -103,7 +103,13 @@ def test_examples_show_what_compositing_computes(kernel: Kernel):
 
 
 # loops before it find and gather raster rows, and evaluate forms at corners; a loop after it writes the sums out
-LOOPS = {"composite-point": 4, "composite-point-kept": 4, "composite-point-backward": 4, "gaussian-blending": 1}
+LOOPS = {
+    "composite-point": 4,
+    "composite-point-kept": 4,
+    "order-point": 4,
+    "composite-point-backward": 4,
+    "gaussian-blending": 1,
+}
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -442,6 +448,16 @@ def test_compiled_images_are_the_eager_ones(built, recipe, degree):
     assert difference.max() < 0.02
 
 
+def test_compiled_passes_by_order_are_the_eager_ones(built):
+    scene, camera = sized(make_scene(400)), make_camera(size=(150, 110))
+    assert built.ready(order.pass_kernel(POINT))
+    names = ["id", "depth-median", "depth-nearest", "samples"]
+    fast, eager = (Renderer.of(scene, [camera], rasterizer=Tiled(k)).passes(camera, names) for k in (built, EAGER))
+    for name in names:
+        assert fast[name].unique().numel() > 10
+        assert torch.isclose(fast[name], eager[name], rtol=1e-5).double().mean() > 0.998, "more than flips at a cut-off"
+
+
 @pytest.mark.parametrize("at_once", [13, 1000])
 def test_compiled_gradients_are_the_eager_ones_in_parts_and_at_once(built, at_once, monkeypatch):
     scene, camera = make_scene(100, degree=2), make_camera()
@@ -497,7 +513,7 @@ def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
     return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
 
 
-PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray"}
+PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray", "order-point"}
 EVERY = {kernel.name for kernel in compiled.KERNELS}
 
 
@@ -577,6 +593,7 @@ SECONDS = {  # to compile, measured; the others take 7 to 15
     "composite-point": 63,
     "composite-point-kept": 63,
     "project-backward": 38,
+    "order-point": 30,
     "composite-point-backward": 27,
     **{f"shade-{n}-gradients": t for n, t in ((4, 11), (9, 21), (16, 23))},
 }

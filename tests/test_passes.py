@@ -17,8 +17,8 @@ from aaplug.core.passes import PASSES
 from aaplug.io.image_formats import IMAGE_FORMATS, PNG, Storage
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.layers import write_layers
-from aaplug.methods.order import Order
 from aaplug.rasterizers.reference import REFERENCE
+from aaplug.rasterizers.tiled.order import Order
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.frames import write_frames
 from tests.conftest import SAMPLE, make_camera, make_scene, make_splats, run_python

@@ -21,8 +21,8 @@ from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.gsplat.arguments import Options, View
-from aaplug.methods.order import Order
 from aaplug.methods.pixel_kernels.surfel import SURFEL, Surfel
+from aaplug.rasterizers.tiled.order import Order
 from aaplug.rendering.passes import MAX_NUMBER
 
 REACH = 3.33  # standard deviations: gsplat's radius of a disc

@@ -32,7 +32,7 @@ from aaplug.core.passes import NormalAxes
 from aaplug.core.projection import thinnest_axes, with_depth_slopes
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.order import Shown
+from aaplug.rasterizers.tiled.order import Shown
 from aaplug.system.errors import UsageError
 
 MOST_TILT = 4.0  # growth of depth along a plane over the way across the view: 76°

@@ -41,13 +41,13 @@ from aaplug.io.limits import lack_for_samples
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.scene import Scene, SceneFrames, without_harmonics
 from aaplug.methods.filters.matched import Matched
-from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY, with_copies
 from aaplug.methods.presets import find_recipe, suited
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import CHANNELS, channels_at_once, find_rasterizer, kernels_of
+from aaplug.rasterizers.tiled.order import Order, Shown
 from aaplug.rendering.light import lights
 from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import Range, check_fields, contract

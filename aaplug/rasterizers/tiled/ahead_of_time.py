@@ -43,7 +43,7 @@ from aaplug.methods.pixel_kernels.gradients import SumsGradients
 from aaplug.methods.pixel_kernels.point import FROM_SUMS, POINT, POINT_ROWS, POINT_ROWS_BACKWARD
 from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.methods.recipe import Recipe
-from aaplug.rasterizers.tiled import backward, binning, forward, layout
+from aaplug.rasterizers.tiled import backward, binning, forward, layout, order
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rasterizers.tiled.sources import sources_of
 from aaplug.system.digests import digest_of_files
@@ -63,9 +63,10 @@ IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `
     POINT_ROWS,
     forward.pass_kernel(POINT),
 )
-KERNELS: tuple[Kernel, ...] = (  # with those of lenses and of gradients
+KERNELS: tuple[Kernel, ...] = (  # with those of lenses, of passes such as ids, and of gradients
     *IMAGE_KERNELS,
     forward.pass_kernel(RAY),
+    order.pass_kernel(POINT),
     backward.SLOTS,
     POINT_ROWS_BACKWARD,
     FROM_SUMS,
@@ -89,6 +90,7 @@ DRAWN = [(pixel, channels) for pixel in (POINT, ABSOLUTE_POINT) for channels in 
 SLOW = {  # to compile: how many times as long as most, which take about 10 s of a processor
     **{forward.pass_kernel(*drawn, keeps).name: 6 for drawn in DRAWN for keeps in (False, True)},
     projection.PROJECT_BACKWARD.name: 4,
+    order.pass_kernel(POINT).name: 3,
     **{backward.step_kernel(*drawn).name: 3 for drawn in DRAWN},
     **{shading.gradients_kernel(n).name: 2 for n in shading.COMPILED_COEFFICIENTS[1:]},
 }

@@ -119,8 +119,8 @@ def _composite_block(
         first, counts, origins = (x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins))
         lists = torch.stack([first + start, first + counts], dim=1)
         corners = functional.pad(origins, (0, 1), value=1.0)
-        going, rest = _going(counts - start, splats), tiles[:0]
-        before, steps = [], [] if segments is None else _going(counts - start, STEP)
+        going, rest = tiles_left(counts - start, splats), tiles[:0]
+        before, steps = [], [] if segments is None else tiles_left(counts - start, STEP)
         if segments is not None:
             segments.append(Segment(tiles, start, lists, corners, before))
         part = whole = [lists, corners, T, *planes.unbind(), *rays]
@@ -153,7 +153,7 @@ def _composite_block(
         planes, rays = planes.index_select(1, rest), [x.index_select(0, rest) for x in rays]
 
 
-def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
+def tiles_left(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     """The number of tiles in each pass of `at_once` splats.  counts: splats left per tile, falling."""
     passes = ((counts + (at_once - 1)) // at_once).int()
     turns = torch.arange(1, int(passes[0]) + 1, dtype=torch.int32, device=counts.device)
