@@ -172,6 +172,13 @@ def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(mo
     assert figures[2] > figures[3] + 2
 
 
+def test_a_drawing_of_an_exposure_is_the_mean_of_its_frames_which_share_the_samples_of_a_pixel():
+    renderer = aaplug.Renderer.of(make_scene(50), [VIEW], "auto", min_seen=0.0)
+    camera, small = exposed(APERTURE, (VIEW, MOVED), 4), exposed(APERTURE, (VIEW, MOVED), 4).scaled(1 / 4)
+    assert renderer.draw(camera).render.rgb.equal(renderer(camera).rgb)
+    assert renderer.samples(small) == renderer.samples(replace(small, exposure=None)) / 2
+
+
 def walls() -> aaplug.Gaussians:
     """A red wall of many splats, a blue one close behind it that is hidden, and a green one far behind, to one side."""
     side = torch.linspace(-1.0, 1.0, 21)

@@ -6,7 +6,7 @@ sample's camera stands at its place in the opening, its principal point moved so
 
 What follows is aaplug's own.  Each sample stands for a cell of the set, and so its splats are convolved with their path
 across that cell: samples that are few overlap instead of showing as ghosts.  A single sample takes the whole path.
-`rendering.light` says how much light a splat has then.
+`core.light` says how much light a splat has then.
 """
 
 import math
@@ -31,10 +31,17 @@ MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
 MAX_GENERATORS = 256  # lattices tried
 
 
+def frame_count(camera: Camera) -> int:
+    """Number of frames that a view is the mean of: the samples of its exposure, or 1."""
+    return 1 if camera.exposure is None else camera.exposure.samples
+
+
 def sample_cameras(camera: Camera) -> Iterator[Camera]:
-    """The camera of each sample of its exposure, which it keeps: `cells` reads it."""
+    """The camera of each sample of its exposure, which it keeps: `cells` reads it; without one the camera itself."""
     exposure = camera.exposure
-    assert exposure is not None
+    if exposure is None:
+        yield camera
+        return
     for x, y, u, v, time in lattice(exposure.samples).tolist():
         moved = camera if exposure.motion is None else toward(*exposure.motion, time)
         right, down = (0.0, 0.0) if exposure.aperture is None else opening(exposure.aperture, u, v)

@@ -8,6 +8,7 @@ from operator import mul
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
+from aaplug.core.exposures import frame_count
 from aaplug.io.limits import SAMPLE_BYTES
 from aaplug.rendering.renderer import Renderer
 
@@ -28,10 +29,10 @@ class Cost(NamedTuple):
 def cost_of(renderers: Iterable[Renderer], views: Iterable[Camera]) -> Cost:
     """The cost of rendering every view with every renderer, one after another."""
     views, found = list(views), Cost(0.0, 0.0, 0.0)
+    counts = [*map(frame_count, views)]
     for renderer in renderers:
         per_gaussian, per_sample = COMPILED if renderer.rasterizer.name == "compiled" else EAGER
-        counts, sides = zip(*map(renderer.frames, views), strict=True) if views else ((), ())
-        samples = [view.width * view.height * side**2 for view, side in zip(views, sides, strict=True)]
+        samples = [view.width * view.height * renderer.samples(view) ** 2 for view in views]
         drawn = sum(map(mul, counts, samples))
         found = Cost(
             found.seconds + per_gaussian * len(renderer.scene) * sum(counts) + per_sample * drawn,

@@ -10,7 +10,7 @@ and weighing the samples of each pixel.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial, reduce
+from functools import partial
 from os import PathLike
 from typing import Annotated, NamedTuple
 
@@ -22,12 +22,13 @@ from aaplug.core.cameras import Camera, CameraSet, Factor
 from aaplug.core.colours import BLACK, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.ellipses import cull
-from aaplug.core.exposures import sample_cameras, spread_out
+from aaplug.core.exposures import frame_count, sample_cameras, spread_out
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns, SortsTiles
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
+from aaplug.core.light import lights
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.core.projection import project, with_depth_slopes, with_ray_slopes
 from aaplug.core.pyramids import Cutter, faded
@@ -220,30 +221,27 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            if camera.exposure is None:
-                return self.draw(camera).render
-            if (now := self.at(camera.frame)) is not self:
-                return now(camera)
-            count, samples = self.frames(camera)
-            weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
-            fine = self._fine(camera, samples)
-            light = self._light(fine, samples)
-            frames = (self.paint(self.splats(each, samples, light), fine.hw) for each in sample_cameras(fine))
-            pixels = (average_samples(frame, samples, weight) for frame in frames)
-            rgb, alpha = reduce(lambda total, frame: Render(*map(torch.add, total, frame)), pixels)
-            return Render(rgb / count, alpha / count)
+            return self.draw(camera).render
 
     @contract
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
-        """Render one view and keep its splats, for example to read their gradients."""
+        """Render one view and keep its splats, of an exposure its last frame's, for example to read their gradients."""
         if (now := self.at(camera.frame)) is not self:
             return now.draw(camera)
         samples, weight = self.sampling(camera)
         fine = self._fine(camera, samples)
-        splats = self.splats(fine, samples)
-        image = self.paint(splats, fine.hw)
-        return Drawing(average_samples(image, samples, weight), splats, fine.hw)
+        light, render, splats = self._light(fine, samples), None, None
+        for each in sample_cameras(fine):
+            splats = self.splats(each, samples, light)
+            image = self.paint(splats, fine.hw)
+            pixels = average_samples(image, samples, weight)
+            render = pixels if render is None else Render(*map(torch.add, render, pixels))
+        assert render is not None
+        assert splats is not None
+        if (count := frame_count(fine)) > 1:
+            render = Render(render.rgb / count, render.alpha / count)
+        return Drawing(render, splats, fine.hw)
 
     def _fine(self, camera: Camera, samples: int) -> Camera:
         """The camera of the supersampled image; raises UsageError where memory does not suffice."""
@@ -354,26 +352,21 @@ class Renderer:
     def sampling(self, camera: Camera, samples: int | None = None) -> tuple[int, float]:
         """Samples along a pixel's side, and the weight of those on either side of each; constants to gradients.
 
+        The frames of an exposure share the pixel: in all they have at least the recipe's samples.
+
         samples: instead of the recipe's number.
         """
-        recipe, weighs = self.recipe, self.recipe.neighbours > 0 and self.cutter is None
+        recipe, frames = self.recipe, frame_count(camera)
+        weighs = recipe.neighbours > 0 and self.cutter is None and frames == 1
         rate = self.relative_rate(camera) if weighs or (samples is None and recipe.target_rate) else 1.0
         if samples is None:
             samples = recipe.samples_at(rate) if recipe.target_rate else recipe.grid
             if recipe.target_rate and self.cutter is not None and recipe.levels is not None:
                 for_coarsest = math.ceil(0.5 ** (len(self.cutter.pyramid) - 1) / rate - RATE_TOLERANCE)
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
+            samples = math.ceil(samples / math.sqrt(frames) - RATE_TOLERANCE)
         sampled_rate = max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
         return samples, recipe.neighbours_at(sampled_rate) if weighs else 0.0
-
-    @contract
-    def frames(self, camera: Camera) -> tuple[int, int]:
-        """Frames that a view is the mean of, and samples along a pixel's side in each.
-
-        In all they are at least the recipe's samples, because the frames of an exposure share the pixel, too.
-        """
-        count = 1 if camera.exposure is None else camera.exposure.samples
-        return count, math.ceil(self.samples(camera) / math.sqrt(count) - RATE_TOLERANCE)
 
     @contract
     def coarsening(self, camera: Camera, samples: int) -> float:
@@ -487,10 +480,10 @@ class Renderer:
         recipe, training, kernels = self.recipe_through(camera), self.training, self.kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules, clamped=not recipe.pixel.needs_depth_slopes)
-        if recipe.selection is not None:
-            splats = asked("selection", recipe.selection, "__call__", splats, chunk)
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
+        if recipe.selection is not None:
+            splats = asked("selection", recipe.selection, "__call__", splats, chunk)
         own, screen = splats.sources, recipe.screen
         if isinstance(screen, ReadsColumns):
             found = {name: chunk.extras[name] for name in screen.columns if name in chunk.extras}

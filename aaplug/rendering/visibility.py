@@ -13,7 +13,7 @@ from torch import Tensor
 from aaplug.core.camera_paths import free_views
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.colours import BLACK
-from aaplug.rendering.light import transmittances
+from aaplug.core.light import transmittances
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.monitor import Tell
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
+from aaplug.core.exposures import frame_count
 from aaplug.io.cameras import read_camera_path, select_views
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.frames import write_frames
@@ -63,7 +64,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
 def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     """Recipe, views, sizes and samples per pixel of the images to render, in words."""
     rates = [renderer.relative_rate(view) for view in views]
-    counts, samples = (sorted(set(column)) for column in zip(*map(renderer.frames, views), strict=True))
+    counts, samples = (sorted({*map(count, views)}) for count in (frame_count, renderer.samples))
     grid = " or ".join(f"{n}×{n}" for n in samples)
     exposed = any(view.exposure for view in views)
     mean = f", mean of {' or '.join(map(str, counts))} frames" * exposed
