@@ -171,13 +171,14 @@ class Job(Generic[O_co]):
         """
         if not self.cameras.assumed:
             return
-        rate, *others = self.cameras.notes
-        for note in (*others, rate):
-            self.monitor.say(note)
+        rate, *lines = self.cameras.notes
+        lines.append(rate)
         if renderer is not None:
             decibels = decibels_at(renderer, view or self.cameras.test[0], (0.5, 2.0))
             half, twice = ("the same" if dB == math.inf else f"{dB:.0f} dB from this one" for dB in decibels)
-            self.monitor.say(f"with half that rate the image would be {half}, with twice {twice}")
+            lines.append(f"with half that rate the image would be {half}, with twice {twice}")
+        for line in lines:
+            self.monitor.say(line)
 
     def announce(
         self,

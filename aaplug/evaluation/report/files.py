@@ -55,11 +55,12 @@ def write_page(
     from aaplug.evaluation.report.webpage import page
 
     figures = plots(report, bounds)
-    paths = write_texts(images.folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
-    beside = make_folder(images.folder / PLOTS)
-    for plot in figures:
-        for suffix, data in zip(PLOT_SUFFIXES, (plot.png(), plot.svg().encode()), strict=True):
-            write_file(beside / (plot.name + suffix), data, overwrite=True)
+    text = page(name, report, bounds, figures, images, facts)
+    drawn = {plot.name: (plot.png(), plot.svg().encode()) for plot in figures}
+    paths, beside = write_texts(images.folder, {PAGE: text}, overwrite), make_folder(images.folder / PLOTS)
+    for plot, kinds in drawn.items():
+        for suffix, data in zip(PLOT_SUFFIXES, kinds, strict=True):
+            write_file(beside / (plot + suffix), data, overwrite=True)
     return [*paths, beside]
 
 
