@@ -4,7 +4,8 @@
     image = renderer(cameras.test[0].scaled(1 / 4)).rgb
 
 This module holds the whole flow: world filter, projection, selection, screen filter, culling, shading, rasterization,
-and weighing the samples of each pixel.
+and weighing the samples of each pixel.  `Renderer.draw` lists the stages of a view, `Renderer._projected` those of its
+splats.
 """
 
 import math
