@@ -50,7 +50,6 @@ from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import CHANNELS, channels_at_once, find_rasterizer, kernels_of
 from aaplug.rasterizers.tiled.order import Order, Shown
-from aaplug.rendering.light import lights
 from aaplug.rendering.passes import by_order, composited, expected
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.cores import on_free_cores
