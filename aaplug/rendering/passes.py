@@ -94,12 +94,13 @@ def expected(
         height, width = image.alpha.shape
         x, y = (torch.arange(side).to(image.alpha) + 0.5 for side in (width, height))
         at_corner, right, down = layers["depth"].unbind(dim=2)
-        depth = at_corner + x * right + y[:, None] * down
-        rays = camera.rays(torch.stack([x.expand_as(depth), y[:, None].expand_as(depth)], dim=2))
-        layers["depth"] = along = depth[..., None]
-        if camera.lens.projection == "ortho":
-            along = torch.stack([image.alpha, image.alpha, depth], dim=2)
-        layers["position"] = (rays * along) @ camera.cam_from_world[:3, :3].to(rays)
+        layers["depth"] = along = (at_corner + x * right + y[:, None] * down)[..., None]
+        if "position" in names:
+            rays = camera.rays(torch.stack(torch.broadcast_tensors(x, y[:, None]), dim=2))
+            if camera.lens.projection == "ortho":
+                flat = image.alpha[..., None]
+                along = torch.cat([flat, flat, along], dim=2)
+            layers["position"] = (rays * along) @ camera.cam_from_world[:3, :3].to(rays)
     layers = {name: layer for name, layer in layers.items() if name in names}
     image = average_samples(Render(torch.cat([*layers.values()], dim=2), image.alpha), samples, weight)
     covered = image.alpha[..., None] > 0
