@@ -59,18 +59,15 @@ class SceneFormat(Protocol):
 
 @runtime_checkable
 class WritableFormat(SceneFormat, Protocol):
-    """A format that can be written too.  needs: a package that writing imports, or None.
+    """A format that can be written too.
 
-    It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.  A format
-    whose files another one reads, names it as `read_as`.  What the files of this name keep is in the attribute `keeps`;
-    a warning names what is lost, all of the following without this attribute:
+    Attributes that it may have: `needs` is a package that writing imports, which comes with aaplug's extra `extra`, or
+    else that of the format's name.  A format whose files another one reads, names it as `read_as`.  What the files of
+    this name keep is in `keeps`; a warning names what is lost, all of the following without this attribute:
         "harmonics": those above degree 0.
         "record": the convention and fusions.  "compensation": of the convention, whether opacities are compensated.
         "extras": what `ply.beside` names.
     """
-
-    @property
-    def needs(self) -> str | None: ...  # noqa: D102
 
     def write(
         self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
@@ -259,9 +256,9 @@ def check_scene_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath]
     if writer is None:
         known = [_ending(format) for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
-    if writer.needs is not None:
-        problem = f"writing .{writer.name} needs {writer.needs}"
-        check_installed(writer.needs, getattr(writer, "extra", writer.name), str(path), problem)
+    if needs := getattr(writer, "needs", None):
+        extra = getattr(writer, "extra", writer.name)
+        check_installed(needs, extra, str(path), f"writing .{writer.name} needs {needs}")
     check_output(path, overwrite, inputs)
     return writer
 

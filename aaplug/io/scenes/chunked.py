@@ -19,7 +19,7 @@ from aaplug.io import STREAM_INDEXES
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes import sog, spz
 from aaplug.io.scenes.lcc import CREDIT, turned_from_z_up
-from aaplug.io.scenes.packed import Piece, rows_of
+from aaplug.io.scenes.packed import Piece, in_a_row
 from aaplug.io.scenes.rows import HEAD_BYTES, SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place, natural, object_of, parse_json, read_bounded, read_start, text
@@ -59,7 +59,7 @@ class Chunks:
         first = natural(entry.fields.get(start, 0), entry.place, start, chunk.count)
         left = chunk.count - first
         count = natural(entry.fields.get("count", left), entry.place, "count", left)
-        return count, lambda start, stop: chunk.load(first + start, first + stop)
+        return Piece(count, chunk.sh_degree, lambda start, stop: chunk.load(first + start, first + stop))
 
 
 @dataclass(frozen=True)
@@ -83,22 +83,19 @@ class ChunkedFormat:
         with library_errors(path):
             data, chunks = TRAILING_COMMA.sub(rb"\1", read_bounded(path, whole_limit("JSON"))), Chunks(path, options)
             pieces = self.pieces(object_of(parse_json(data, path), path, "its tree", "a tree of chunks"), chunks)
-        opened, count = [*chunks.opened.values()], sum(count for count, _ in pieces)
+        opened, rows = [*chunks.opened.values()], in_a_row(pieces)
         held = sum(chunk.count for chunk in opened)
-        if count > held or not opened:
-            raise FormatError(path, f"names {count:,} Gaussians in files that hold {held:,}")
-        first, degree = opened[0], max(chunk.sh_degree for chunk in opened)
+        if rows.length > held or not opened:
+            raise FormatError(path, f"names {rows.length:,} Gaussians in files that hold {held:,}")
+        first = opened[0]
         for chunk in opened:
             if (chunk.convention, chunk.fused, chunk.flat) != (first.convention, first.fused, first.flat):
                 raise FormatError(path, f"names files of several rules of drawing: {first.path}, {chunk.path}")
         others = tuple(file for chunk in opened for file in chunk.files)
         notes = (f"the finest level, in {counted(len(opened), 'file')}", *self.notes)
-
-        def load(start: int, stop: int) -> Gaussians:
-            return self.turned(rows_of(pieces, degree, start, stop))
-
+        turned = rows._replace(load=lambda start, stop: self.turned(rows.load(start, stop)))
         facts = first.evidence, first.convention, first.fused, first.flat
-        return Scene(path, self.name, count, degree, load, *facts, notes=notes, others=others)
+        return Scene(path, self.name, *turned, *facts, notes=notes, others=others)
 
 
 def _nodes(root: Entry, children: str) -> Iterator[tuple[Entry, bool]]:
@@ -126,7 +123,7 @@ def _streamed_sog(root: Entry, chunks: Chunks) -> list[Piece]:
     pieces = [chunks.rows(names, level.entry("0"), "file", "offset") for level in levels if "0" in level]
     if "environment" in root:
         far = chunks.open(root.get("environment", text))
-        pieces.append((far.count, far.load))
+        pieces.append(Piece(far.count, far.sh_degree, far.load))
     return pieces
 
 

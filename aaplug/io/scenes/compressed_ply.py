@@ -41,7 +41,6 @@ MOST_DEGREE = 3
 LARGEST_LOG_SCALE = 20.0  # absolute: a wider chunk of log-scales would leave its steps too coarse
 
 name = "compressed.ply"
-needs = None
 keeps = ("harmonics", "record")
 
 

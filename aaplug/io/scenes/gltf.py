@@ -12,7 +12,7 @@ of ours in the primitive's `extras`.
 
 import io
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, chain
@@ -28,7 +28,7 @@ from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.atomic import replacing, write_file
 from aaplug.io.gltf import FLOAT, MAGIC, Gltf, Table, at_rest, glb_start
 from aaplug.io.scenes import spz
-from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, logit_of, replacing_group, rows_of, standing
+from aaplug.io.scenes.packed import Piece, bytes_of, half_turn_about_z, in_a_row, logit_of, replacing_group, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import SceneFileOptions, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
@@ -44,6 +44,7 @@ COLOUR = "COLOR_0"
 MOST_DEGREE = 3
 MOST_BYTES = 2**32 - 1  # of a .glb, whose size is 32 bits
 ROOM = 8192  # bytes of JSON, padded so that the smallest and largest position can be filled in at the end
+LINEAR_NOTE = "its colours are linear, and are taken as they are"
 EVIDENCE = "glTF does not say: assumed classic (3DGS default)"
 
 
@@ -57,7 +58,6 @@ class GltfFormat:
     """Files of one suffix.  Raises as `SceneFormat` and `WritableFormat`."""
 
     name: str
-    needs: str | None = None
     keeps: tuple[str, ...] = ("harmonics", "record")
 
     def sniff(self, path: Path, head: bytes) -> bool:
@@ -73,15 +73,17 @@ class GltfFormat:
             wanted = document.root.fields.get("extensionsRequired", [])
             unknown = [each for each in wanted if each not in UNDERSTOOD] if isinstance(wanted, list) else [wanted]
             document.root.place.expect(not unknown, "extensionsRequired", f"of {', '.join(UNDERSTOOD)}", unknown)
-            parts, facts = _primitives(document), Facts(EVIDENCE)
-            if not parts:
+            pieces, count, facts, colours = list[Piece](), 0, Facts(EVIDENCE), list[object]()
+            for primitive, splats, motion in _primitives(document):
+                pieces.append(_piece(document, primitive, splats, motion))
+                count += pieces[-1].length
+                check_count(path, count)  # before more is unpacked
+                facts = read_record(path, primitive.entry("extras").fields if "extras" in primitive else {}, facts)
+                colours.append(splats.fields.get("colorSpace"))
+            if not pieces:
                 raise FormatError(path, f"holds no points with the extension {SPLATS}; is it a mesh?")
-            for part in parts:
-                facts = read_record(path, part.extras, facts)
-        count, degree = sum(part.count for part in parts), max(part.degree for part in parts)
-        notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
-        load, others = partial(rows_of, [(part.count, part.load) for part in parts], degree), tuple(document.files)
-        return Scene(path, self.name, count, degree, load, *facts, notes=tuple(filter(None, notes)), others=others)
+        notes = [f"{len(pieces)} primitives"] * (len(pieces) > 1) + [LINEAR_NOTE] * ("lin_rec709_display" in colours)
+        return Scene(path, self.name, *in_a_row(pieces), *facts, notes=tuple(notes), others=tuple(document.files))
 
     def write(
         self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
@@ -113,19 +115,9 @@ FORMATS = (GltfFormat("spz.glb"), GltfFormat("glb"), GltfFormat("gltf"))
 # Reading
 
 
-@dataclass(frozen=True)
-class Primitive:
-    """Points of a mesh.  load: their rows; note: a fact worth printing."""
-
-    count: int
-    degree: int
-    load: Callable[[int, int], Gaussians]
-    extras: dict[str, Any]
-    note: str = ""
-
-
-def _primitives(document: Gltf) -> list[Primitive]:
-    nodes, found, count = document.items("nodes"), list[Primitive](), 0
+def _primitives(document: Gltf) -> Iterator[tuple[Entry, Entry, Float[Tensor, "4 4"]]]:
+    """Primitives of splats, their extension, and the transforms that place them."""
+    nodes = document.items("nodes")
     motions: dict[int | None, Float[Tensor, "4 4"]] = {None: torch.eye(4, dtype=torch.float64)}
     for index, above in document.parents.items():
         motions[index] = motions[above] @ at_rest(nodes[index])
@@ -136,19 +128,14 @@ def _primitives(document: Gltf) -> list[Primitive]:
             primitive = Entry(mesh.place, each.fields)
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
             if SPLATS in extensions:
-                found.append(_primitive(document, primitive, extensions.entry(SPLATS), motion))
-                count += found[-1].count
-                check_count(document.path, count)  # before more is unpacked
-    return found
+                yield primitive, extensions.entry(SPLATS), motion
 
 
-def _primitive(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Tensor, "4 4"]) -> Primitive:
+def _piece(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Tensor, "4 4"]) -> Piece:
     place = primitive.place
     place.expect(primitive.fields.get("mode") == POINTS, "mode", "0 (points)", primitive.fields.get("mode"))
-    kernel, colours = splats.fields.get("kernel", "ellipse"), splats.fields.get("colorSpace")
+    kernel = splats.fields.get("kernel", "ellipse")
     place.expect(kernel == "ellipse", "kernel", "ellipse", kernel)
-    note = "its colours are linear, and are taken as they are" if colours == "lin_rec709_display" else ""
-    extras = primitive.entry("extras").fields if "extras" in primitive else {}
     inner = splats.entry("extensions") if "extensions" in splats else splats
     if SPZ in inner:
         view, _ = document.view(inner.entry(SPZ))
@@ -164,7 +151,7 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry, motion: Float[Te
         counts = {count for count, _ in tables.values()}
         place.expect(len(counts) == 1, "attributes", "as many rows each", sorted(counts))
         count, load = counts.pop(), partial(_read, tables, degree)
-    return Primitive(count, degree, lambda start, stop: standing(load(start, stop), motion, place), extras, note)
+    return Piece(count, degree, lambda start, stop: standing(load(start, stop), motion, place))
 
 
 def _read(tables: dict[str, Table], degree: int, start: int, stop: int) -> Gaussians:

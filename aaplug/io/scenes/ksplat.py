@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.packed import byte_opacities, floats, of_degree, sh_of_colour
+from aaplug.core.gaussians import Gaussians
+from aaplug.io.scenes.packed import Piece, byte_opacities, floats, in_a_row, sh_of_colour
 from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -44,7 +44,8 @@ Section = namedtuple("Section", "count room capacity buckets block bucket_size r
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
-        data, parts = path.read_bytes(), list[Gaussians]()
+        data, none = path.read_bytes(), torch.zeros(0, 3)
+        parts = [Piece.of(Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), none[:, None]))]
         if len(data) < MAIN_SIZE:
             raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")
         major, minor, number, count, level, *ends = MAIN.unpack_from(data)
@@ -57,15 +58,11 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         for index in range(number):
             section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
             part, at = _decoded(path, data, at, section, level, ends)
-            parts.append(part)
-        if sum(map(len, parts)) != count:
-            raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
-        degree = max((part.sh_degree for part in parts if len(part)), default=0)
-        none = torch.zeros(0, 3)
-        empty = Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), torch.zeros(0, (degree + 1) ** 2, 3))
-        scene = joined([empty, *(of_degree(part, degree) for part in parts)])
-    notes = (f"compression level {level}",)
-    return Scene(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
+            parts += [Piece.of(part)] if len(part) else []
+    rows = in_a_row(parts)
+    if rows.length != count:
+        raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
+    return Scene(path, name, *rows, EVIDENCE, notes=(f"compression level {level}",))
 
 
 def _decoded(

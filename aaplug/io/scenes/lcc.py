@@ -19,7 +19,7 @@ from torch import Tensor
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import placed
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.packed import Piece, byte_opacities, floats, fractions, rows_of, sh_of_colour, word_quats
+from aaplug.io.scenes.packed import Piece, byte_opacities, floats, fractions, in_a_row, sh_of_colour, word_quats
 from aaplug.io.scenes.rows import SceneFileOptions, by_name, library_errors, read_rows
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -66,15 +66,10 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
             if rest:
                 raise FormatError(sky, f"has {sky.stat().st_size:,} bytes, not a multiple of {far.itemsize}")
             read = partial(read_rows, sky, far)
-            pieces.append((count, partial(_load, read, read, ends([f"env{kind}" for kind in kinds]))))
-    count = sum(count for count, _ in pieces)
+            pieces.append(Piece(count, degree, partial(_load, read, read, ends([f"env{kind}" for kind in kinds]))))
     used = tuple(beside[each] for each in (*names, "environment.bin") if each in beside)
     notes = (f"the finest of {levels} levels", CREDIT)
-
-    def load(start: int, stop: int) -> Gaussians:
-        return turned_from_z_up(rows_of(pieces, degree, start, stop))
-
-    return Scene(path, name, count, degree, load, EVIDENCE, notes=notes, others=used)
+    return Scene(path, name, *in_a_row(pieces), EVIDENCE, notes=notes, others=used)
 
 
 def turned_from_z_up(scene: Gaussians) -> Gaussians:
@@ -83,7 +78,7 @@ def turned_from_z_up(scene: Gaussians) -> Gaussians:
 
 
 def _load(read: Read, read_harmonics: Read, ends: Sequence[Float[Tensor, "2 3"]], start: int, stop: int) -> Gaussians:
-    """The rows from start up to stop, in the file's axes.  ends: of scales, and of harmonics if there are any."""
+    """The rows from start up to stop.  ends: of scales, and of harmonics if there are any."""
     rows = read(start, stop)
     quats = word_quats(rows["quats"], *COMPONENTS).roll(1, dims=1)
     scales = torch.lerp(ends[0][0], ends[0][1], floats(rows["scales"]) / MOST_SCALE)
@@ -91,7 +86,8 @@ def _load(read: Read, read_harmonics: Read, ends: Sequence[Float[Tensor, "2 3"]]
     if len(ends) > 1:
         values = fractions(read_harmonics(start, stop)["sh"][:, :COEFFICIENTS], *CHANNELS)
         sh = torch.cat([sh, torch.lerp(ends[1][0], ends[1][1], values)], dim=1)
-    return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
+    opacities = byte_opacities(rows["rgba"][:, 3])
+    return turned_from_z_up(Gaussians(floats(rows["means"]), quats, scales.log(), opacities, sh))
 
 
 def _ends(path: Path, attributes: dict[str, Entry], wanted: Sequence[str]) -> list[Float[Tensor, "2 3"]]:
@@ -118,5 +114,5 @@ def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Te
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         read = partial(read_rows, data, RECORD, offset=start)
         read_harmonics = partial(read_rows, harmonics, HARMONICS, offset=2 * start)
-        found.append((count, partial(_load, read, read_harmonics, ends)))
+        found.append(Piece(count, 3 * (len(ends) > 1), partial(_load, read, read_harmonics, ends)))
     return found

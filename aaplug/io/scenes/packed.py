@@ -12,6 +12,7 @@ from functools import partial
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +29,20 @@ from aaplug.system.contracts import contract
 MAX_BYTE = 255
 HASH_DIGITS = 8  # in the name of a file that another one names
 UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
-Piece = tuple[int, Callable[[int, int], Gaussians]]  # of a scene: how many rows, what reads those from start up to stop
 half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
+
+
+class Piece(NamedTuple):
+    """Rows of a scene: how many, the degree of their harmonics, and what reads those from start up to stop."""
+
+    length: int
+    degree: int
+    load: Callable[[int, int], Gaussians]
+
+    @classmethod
+    def of(cls, scene: Gaussians) -> "Piece":
+        """All rows of a scene in memory."""
+        return cls(len(scene), scene.sh_degree, lambda start, stop: scene[start:stop])
 
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:
@@ -137,12 +150,17 @@ def of_degree(scene: Gaussians, degree: int) -> Gaussians:
     return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))
 
 
-def rows_of(pieces: Sequence[Piece], degree: int, start: int, stop: int) -> Gaussians:
-    """The rows from start up to stop of pieces in a row, with harmonics up to this degree."""
-    read, first = list[Gaussians](), 0
-    for count, load in pieces:
-        begin, end = max(start - first, 0), min(stop - first, count)
-        if begin < end or (start == stop and not read):
-            read.append(of_degree(load(begin, max(begin, end)), degree))
-        first += count
-    return joined(read)
+def in_a_row(pieces: Sequence[Piece]) -> Piece:
+    """All rows of these pieces, with harmonics up to the highest degree."""
+    degree = max((piece.degree for piece in pieces), default=0)
+
+    def rows(start: int, stop: int) -> Gaussians:
+        read, first = list[Gaussians](), 0
+        for count, _, load in pieces:
+            begin, end = max(start - first, 0), min(stop - first, count)
+            if begin < end or (start == stop and not read):
+                read.append(of_degree(load(begin, max(begin, end)), degree))
+            first += count
+        return joined(read) if len(read) > 1 else read[0]
+
+    return Piece(sum(piece.length for piece in pieces), degree, rows)

@@ -42,7 +42,6 @@ MOST_NAMED = 24  # columns in a message
 ROWS_PER_WRITE = 1 << 13  # 2 MB, so that a column's stride stays within the cache
 
 name = "ply"
-needs = None
 keeps = ("harmonics", "record", "extras")
 
 

@@ -54,7 +54,6 @@ BYTES_PER_PIXEL = 4
 SPARE_PIXELS = 1 << 16  # pixels allowed beyond twice the number of Gaussians
 
 name = "sog"
-needs = None
 keeps = ("harmonics", "record")
 
 Fetch = Callable[[str, int], bytes]
@@ -225,7 +224,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 class _Unbundled:
     """The meta.json of a folder; it is read as `sog`."""
 
-    name, needs, keeps, read_as = META, None, keeps, name
+    name, keeps, read_as = META, keeps, name
     sniff, open_scene, write = staticmethod(by_name()), staticmethod(open_scene), staticmethod(write)
 
 

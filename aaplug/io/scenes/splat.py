@@ -25,7 +25,6 @@ ZERO_BYTE = 128  # the byte that stands for a quaternion component of 0
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
 
 name = "splat"
-needs = None
 sniff = by_name(".splat")
 
 

@@ -75,7 +75,6 @@ NAMED_AXES = {  # axes, and a note, by `spz_axes`
 }
 
 name = "spz"
-needs = None
 keeps = ("harmonics", "compensation")
 
 

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file, told_by_library
 from aaplug.io.cameras.usd import module
-from aaplug.io.scenes.packed import floats, half_turn_about_z, logit_of, of_degree, standing
+from aaplug.io.scenes.packed import Piece, floats, half_turn_about_z, in_a_row, logit_of, standing
 from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
@@ -54,7 +54,7 @@ class UsdFormat:
     """Files of one suffix.  Raises as `SceneFormat` and `WritableFormat`."""
 
     name: str
-    needs: str | None = PACKAGE
+    needs: str = PACKAGE
     keeps: tuple[str, ...] = ("harmonics", "record")
     extra: str = "usd"
 
@@ -77,13 +77,12 @@ class UsdFormat:
                 arrays = dict(loaded)
             if "refused" in told:
                 raise FormatError(path, told["refused"])
-            parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(told["prims"])]
-            degree = max(part.sh_degree for part in parts)
-            scene = joined([of_degree(part, degree) for part in parts])
+            prims = enumerate(told["prims"])
+            rows = in_a_row([Piece.of(_read(path, prim, number, arrays, told["up"])) for number, prim in prims])
             said = told["record"]
             record = {} if said is None else {KEY: parse_json(said.encode(), path)}
             facts = read_record(path, record, Facts(EVIDENCE))
-        return Scene(path, self.name, len(scene), degree, lambda start, stop: scene[start:stop], *facts)
+        return Scene(path, self.name, *rows, *facts)
 
     def write(
         self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
