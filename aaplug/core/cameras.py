@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -38,6 +38,8 @@ Side = Annotated[int, Range(1, MAX_SIDE)]  # px
 Focal = Annotated[float, Range(above=0, most=MAX_FOCAL)]  # px
 Place = Annotated[float, Range(-MAX_FOCAL, MAX_FOCAL)]  # px
 Factor = Annotated[float, Range(above=0, most=MAX_FOCAL)]
+Point = tuple[float, float]  # x and y, px
+CORNER: Point = (0.0, 0.0)  # of an image
 
 
 @dataclass(frozen=True)
@@ -160,42 +162,38 @@ class Camera:
         A partial row at the bottom or column at the right is dropped, so that scaled(1/n) sees exactly what n×n box
         averages of the full image see.
         """
-        return self._stretched(whole_side(self.width * factor), whole_side(self.height * factor), factor, factor)
+        return self._moved(whole_side(self.width * factor), whole_side(self.height * factor), factor, factor)
 
     @contract
     def resized(self, width: Side, height: Side) -> "Camera":
         """The same field of view in `width` × `height` px; pixels stop being square if the aspect changes."""
-        return self._stretched(width, height, width / self.width, height / self.height)
+        return self._moved(width, height, width / self.width, height / self.height)
 
     @contract
     def framed(self, width: Side, height: Side) -> "Camera":
         """The same pose in `width` × `height` px, square as before: the shorter side keeps its field of view."""
         factor = min(width, height) / min(self.hw)
-        cx, cy = width / 2 + factor * (self.cx - self.width / 2), height / 2 + factor * (self.cy - self.height / 2)
-        middle = {"cx": cx, "cy": cy, "exposure": self._exposed_as(lambda c: c.framed(width, height))}
-        return replace(self, width=width, height=height, fx=self.fx * factor, fy=self.fy * factor, **middle)
+        middle = self.width / 2, self.height / 2
+        return self._moved(width, height, factor, factor, middle, (width / 2, height / 2))
 
     @contract
     def cropped(self, left: int, top: int, width: Side, height: Side) -> "Camera":
         """`width` × `height` px of this view, whose corner is `left` and `top` px from its own."""
-        exposure = self._exposed_as(lambda camera: camera.cropped(left, top, width, height))
-        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, exposure=exposure)
+        return self._moved(width, height, 1.0, 1.0, (float(left), float(top)))
 
     def as_trained(self) -> "Camera":
         """This view, declared to be a pose of the data set at its training size."""
         return replace(self, trained_focal=self.focal)
 
-    def _stretched(self, width: int, height: int, x: float, y: float) -> "Camera":
-        stretched = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
-        exposure = self._exposed_as(lambda camera: camera._stretched(width, height, x, y))
-        return replace(self, width=width, height=height, **stretched, exposure=exposure)
-
-    def _exposed_as(self, change: "Callable[[Camera], Camera]") -> "Exposure | None":
-        """The exposure with its cameras changed."""
-        if self.exposure is None or self.exposure.motion is None:
-            return self.exposure
-        opened, closed = map(change, self.exposure.motion)
-        return replace(self.exposure, motion=(opened, closed))
+    def _moved(self, width: int, height: int, x: float, y: float, at: Point = CORNER, to: Point = CORNER) -> "Camera":
+        """Another image, of pixels x and y times as dense, in which the place `at` of this one, in px, is at `to`."""
+        lens = {"fx": self.fx * x, "fy": self.fy * y}
+        lens |= {"cx": to[0] + x * (self.cx - at[0]), "cy": to[1] + y * (self.cy - at[1])}
+        exposure = self.exposure
+        if exposure is not None and exposure.motion is not None:
+            opened, closed = (camera._moved(width, height, x, y, at, to) for camera in exposure.motion)
+            exposure = replace(exposure, motion=(opened, closed))
+        return replace(self, width=width, height=height, **lens, exposure=exposure)
 
 
 @dataclass(frozen=True)
