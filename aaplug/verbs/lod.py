@@ -26,7 +26,7 @@ from aaplug.io import StreamName, streamed
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
 from aaplug.io.scenes import SceneLike, check_scene_output, pyramid_folder, write_scene, written_format
-from aaplug.io.scenes.columns import matrix_of
+from aaplug.io.scenes.columns import columns_of
 from aaplug.io.scenes.ply import beside
 from aaplug.io.scenes.pyramid_folder import MANIFEST
 from aaplug.io.scenes.scene import FLOAT, Scene
@@ -215,7 +215,7 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         levels = range(1, (options.levels or DEFAULT_LEVELS) + 1)
         return [Goal(0.5**level, tolerance=TOLERANCE, smallest=options.merge_below) for level in levels]
     if options.budget is not None:
-        columns = len(matrix_of(scene[:0])[0]) + NORMAL_COLUMNS
+        columns = len(columns_of(scene[:0])) + NORMAL_COLUMNS
         header = RECORDS_BYTES + COLUMN_BYTES * columns
         count = min(len(scene), int((options.budget * MEGABYTE - header) / (FLOAT * columns)))
         if count < 1 <= len(scene):

@@ -14,26 +14,24 @@ SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter 
 DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
 
 
-def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
-    """The parameters as columns of a .ply: their names, and a matrix.  A flat scene has two scales.
+def columns_of(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
+    """The parameters as columns of a .ply, by name, in its order.  A flat scene has two scales.
 
     f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.
     """
-    rest = scene.sh[:, 1:].transpose(1, 2).flatten(1)
-    scales = scene.log_scales[:, : 2 if scene.flat else 3]
-    parts = [scene.means, scene.sh[:, 0], rest, scene.logit_opacities[:, None], scales, scene.quats]
-    stems = {"f_dc": 3, "f_rest": rest.shape[1], "opacity": None, "scale": scales.shape[1], "rot": 4}
-    names = list("xyz")
-    for stem, number in stems.items():
-        names += [stem] if number is None else [f"{stem}_{i}" for i in range(number)]
-    if scene.filter_3d is not None:
-        names.append(FILTER_COLUMN)
-        parts.append(scene.filter_3d[:, None])
-    return names, torch.cat(parts, dim=1)
+
+    def numbered(stem: str, table: Float[Tensor, "n c"]) -> dict[str, Tensor]:
+        return {f"{stem}_{i}": column for i, column in enumerate(table.unbind(dim=1))}
+
+    columns = dict(zip("xyz", scene.means.unbind(dim=1), strict=True))
+    columns |= numbered("f_dc", scene.sh[:, 0]) | numbered("f_rest", scene.sh[:, 1:].transpose(1, 2).flatten(1))
+    columns |= {"opacity": scene.logit_opacities, **numbered("scale", scene.log_scales[:, : 2 if scene.flat else 3])}
+    columns |= numbered("rot", scene.quats)
+    return columns if scene.filter_3d is None else columns | {FILTER_COLUMN: scene.filter_3d}
 
 
 def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool) -> Gaussians:
-    """The scene in a matrix of named columns, in any order and among others: the inverse of `matrix_of`."""
+    """The scene in a matrix of named columns, in any order and among others: the inverse of `columns_of`."""
     at = {name: i for i, name in enumerate(names)}
     k = (degree + 1) ** 2
 
@@ -62,8 +60,7 @@ def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     """
     nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
     finite = all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in scene.columns.values())
-    names, matrix = ([], torch.empty(0, 0)) if finite else matrix_of(scene)
-    for name, values in zip(names, matrix.T, strict=True):
+    for name, values in ({} if finite else columns_of(scene)).items():
         limits = {"opacity": (-torch.inf, torch.inf), "scale": (-torch.inf,)}.get(name.split("_")[0], ())
         nans[f"NaN in {name}"] = values.isnan()
         infinities[f"Inf in {name}"] = values.isinf() & ~torch.isin(values, values.new_tensor(limits))

@@ -22,7 +22,7 @@ from torch import Tensor
 from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
-from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of
+from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, columns_of, scene_of
 from aaplug.io.scenes.packed import sh_of_colour
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
@@ -69,7 +69,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)
-    document, names = _document_of(first), [*matrix_of(first[:0])[0], *first.extras]
+    document, names = _document_of(first), [*columns_of(first[:0]), *first.extras]
     if document is None:  # a header as 3DGS writes it, with its order of columns
         lines = [f"property float {c}" for c in (*names[:3], *NORMALS, *names[3:])]
         start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(first)}"]
@@ -196,10 +196,8 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
     records = np.zeros(len(scene), header.vertex.dtype)
-    parameters, matrix = matrix_of(scene)
-    assert not matrix.isnan().any(), "a parameter is NaN"
-    values = dict(zip(parameters, matrix.detach().cpu().numpy().T, strict=True))
-    values |= {name: column.cpu().numpy() for name, column in scene.extras.items()}
+    assert not any(column.isnan().any() for column in scene.columns.values()), "a parameter is NaN"
+    values = {name: column.detach().cpu().numpy() for name, column in (columns_of(scene) | {**scene.extras}).items()}
     old, document = {}, _document_of(scene)
     unchanged = any(c not in values or code != "f4" for c, code in header.vertex.codes.items())
     if unchanged and document and document.table and scene.origin:
