@@ -16,7 +16,7 @@ from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.keyframes import unit
-from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
+from aaplug.io.cameras.photos import distinct, photo_folder, without_suffix
 from aaplug.io.cameras.poses import pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
@@ -51,8 +51,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         root = root.parent
     root = root.parent if "sparse" in root.name else root
     photos = photo_folder(root, options, "images", Place(folder, "images"))
-    source = [_camera(image, intrinsics) for image in images]
-    source = with_photos(source, [image.place for image in images], photos)
+    source = [_camera(image, intrinsics, photos.find(image.name, image.place)) for image in images]
+    photos.check(source)
     folders = dict.fromkeys((root, folder.absolute()))
     lists = [name for each in folders for name in SPLIT_LISTS if os.path.isfile(each / name)]
     unread = [f"lists of views, not read: {', '.join(lists)}"] if lists else []
@@ -78,7 +78,7 @@ def _model_folder(path: Path) -> Path | None:
     return next((t for t in tries if any(os.path.isfile(t / f"cameras{k}") for k in KINDS)), None)
 
 
-def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
+def _camera(image: Image, intrinsics: dict[int, Intrinsics], photo: Path | None) -> Camera:
     if image.camera_id not in intrinsics:
         raise image.place.error(f"uses camera {image.camera_id}, which cameras does not hold")
     lens = intrinsics[image.camera_id]
@@ -93,7 +93,7 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
     quats = unit(torch.tensor([image.quaternion], dtype=torch.float64), image.place, "quaternion")
     turn = rotation_matrices(quats)[0]
     cam_from_world = pose(turn, torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
-    return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
+    return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 
 
 def _distortion(lens: Intrinsics) -> Distortion | None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from aaplug.core.cameras import Camera, CameraSet, centred, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import sets
-from aaplug.io.cameras.photos import photo_folder, with_photos, without_suffix
+from aaplug.io.cameras.photos import photo_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import WIDTH_CAP, CameraFileOptions
 from aaplug.io.limits import whole_limit
@@ -117,8 +117,9 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         size = item.get("width", pixels), item.get("height", pixels)
         fx, fy = item.get("fx", focal), item.get("fy", focal)
         cam_from_world = inverse(pose(rotation, position, item.place, "rotation"))
-        source.append(replace(centred(item.get("img_name", text), size, fx, cam_from_world), fy=fy))
-    source = with_photos(source, [item.place for item in items], photos)
+        name = item.get("img_name", text)
+        source.append(replace(centred(name, size, fx, cam_from_world, photos.find(name, item.place)), fy=fy))
+    photos.check(source)
     views = dict[tuple[object, ...], Camera]()
     for camera in source:  # some runs list a view once per split
         views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)

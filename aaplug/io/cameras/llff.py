@@ -6,7 +6,6 @@ depth.  The rotation's columns are the camera's axes down, right and back.
 
 import os
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.io.cameras import sets
-from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
+from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.limits import whole_limit
@@ -51,18 +50,17 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     photos = len(names)
     if photos != len(rows):
         names = [f"{i:03}" for i in range(len(rows))]
-    places = [Place(file, f"row {i}") for i in range(len(rows))]
     source = list[Camera]()
-    for row, name, place in zip(rows, names, places, strict=True):
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        place = Place(file, f"row {i}")
         values = [number(float(value), place, "it") for value in row]
         matrix = torch.tensor(values[:15], dtype=torch.float64).reshape(3, 5)
-        height, width = (pixels(matrix[i, 4].item(), place, field) for i, field in enumerate(("height", "width")))
+        height, width = (pixels(matrix[k, 4].item(), place, field) for k, field in enumerate(("height", "width")))
         f = focal(matrix[2, 4].item(), place, "focal length")
         down, right, back = matrix[:, :3].unbind(dim=1)
         world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
-        source.append(centred(name, (width, height), f, inverse(world_from_cam)))
-    source = with_photos(source, places, folder)
-    source = [replace(camera, name=last_part(camera.name)) for camera in source]
+        source.append(centred(last_part(name), (width, height), f, inverse(world_from_cam), folder.find(name, place)))
+    folder.check(source)
     uneven = f"photos: {folder.folder.name} holds {photos} and the file {len(rows)} poses, so none is used"
     more = folder.notes(source) if photos in (0, len(rows)) else [uneven]
     trained, why = sets.at_photo_size(source, options)

@@ -9,7 +9,7 @@ import re
 import stat
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from unicodedata import normalize
@@ -61,6 +61,12 @@ class PhotoFolder:
             raise place.error(f"photo {name!r} lies outside {self.home}; {hint}")
         return photo
 
+    def check(self, cameras: Sequence[Camera]) -> None:
+        """Raise UsageError where the user named the folder and no camera has its photo there."""
+        if self.chosen and not photographs(cameras):
+            names = listing([camera.name for camera in cameras], most=3)
+            raise UsageError("images", f"{self.folder} holds no photo of these cameras ({names})")
+
     def notes(self, cameras: Sequence[Camera]) -> list[str]:
         """Notes where no camera has its photo although there are folders of photos, or where there are masks."""
         beside = visible(self.folder.parent)
@@ -81,16 +87,6 @@ def photo_folder(root: Path, options: CameraFileOptions, custom: str, place: Pla
     if not os.path.isdir(folder):
         raise UsageError("images", f"there is no folder {folder}: relative paths start at the cameras' folder")
     return PhotoFolder(folder, folder, chosen=True)
-
-
-def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder) -> list[Camera]:
-    """The cameras with their photos, found by the cameras' names."""
-    pairs = zip(cameras, places, strict=True)
-    photographed = [replace(camera, photo=folder.find(camera.name, place)) for camera, place in pairs]
-    if folder.chosen and not any(camera.photo for camera in photographed):
-        names = listing([camera.name for camera in cameras], most=3)
-        raise UsageError("images", f"{folder.folder} holds no photo of these cameras ({names})")
-    return photographed
 
 
 def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
