@@ -17,13 +17,13 @@ from torch import Tensor
 
 from aaplug.core.camera_paths import free_views
 from aaplug.core.cameras import Camera, spread
-from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.core.gaussians import Gaussians
 from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import run, view_and_weights
+from aaplug.finetuning.session import tuned_scene
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, TUNING_RATES, balance, slowed
 from aaplug.finetuning.state import State, TuningJob, begin, part_of
 from aaplug.io.rad import node_sizes, shown_of
-from aaplug.methods.conversion import TUNED
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import Viewer
 from aaplug.rendering.renderer import Renderer
@@ -82,11 +82,8 @@ def refine(
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
     settings = replace(CONSISTENCY_SETTINGS, name="levels", steps=steps, weights=weights, rates=rates, anchor=0.0)
     settings = slowed(replace(settings, usual_error=USUAL_ERROR), dict.fromkeys((1.0, *weights), before))
-    scene = _tuned(TuningJob(start, views, truth, settings), monitor)
-    if _error(look.showing(scene), truth, probes, rate) >= before:
-        return level
-    record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name if viewer else "levels"})
-    return replace(scene, fused=(*level.fused, record))
+    scene = _tuned(TuningJob(start, views, truth, settings), viewer.name if viewer else "levels", monitor)
+    return level if _error(look.showing(scene), truth, probes, rate) >= before else scene
 
 
 def refine_tree(
@@ -125,20 +122,19 @@ def refine_tree(
     before = errors(start)
     settings = replace(CONSISTENCY_SETTINGS, name="tree", steps=steps, weights=dict.fromkeys(rates, 1.0), anchor=0.0)
     settings = balance(settings, before)
-    scene = _tuned(TuningJob(start, views, truth, settings, method=replace(CONSISTENCY, around=around)), monitor)
+    job = TuningJob(start, views, truth, settings, method=replace(CONSISTENCY, around=around))
+    scene = _tuned(job, viewer.name, monitor)
     after = errors(start.showing(scene))
-    if sum(weight * (after[rate] - before[rate]) for rate, weight in settings.weights.items()) >= 0:
-        return tree
-    record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name})
-    return replace(scene, fused=(*tree.fused, record))
+    change = sum(weight * (after[rate] - before[rate]) for rate, weight in settings.weights.items())
+    return tree if change >= 0 else scene
 
 
-def _tuned(job: TuningJob, monitor: Monitor) -> Gaussians:
-    """The scene of a job after all of its steps."""
+def _tuned(job: TuningJob, shown_by: str, monitor: Monitor) -> Gaussians:
+    """The scene of a job after all of its steps, with a record that names what shows it."""
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:
         run(job, state, every=job.settings.steps, tell=tell)
-    return state.scene(job)
+    return tuned_scene(state, job, job.start.scene.convention, {"for": shown_by})
 
 
 def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tuple[list[Camera], list[Camera]]:
