@@ -127,11 +127,10 @@ def merge(
 
 def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
     """The clusters after all pairs are merged that the goal allows; `tell` is called with how many are gone."""
-    first, least, ceiling = len(clusters), goal.count or 1, -math.inf
-    edges = Edges.none(clusters)
+    first, least, ceiling, edges = len(clusters), goal.count or 1, -math.inf, None
     for tolerance in goal.tolerances:
         min_share = 0.0 if tolerance == math.inf else MIN_MERGED_SHARE
-        if tolerance > ceiling:  # one look at all pairs serves every tolerance of a level
+        if edges is None or tolerance > ceiling:  # one look at all pairs serves every tolerance of a level
             ceiling = tolerance if goal.tolerance == math.inf else goal.tolerance
             edges = edges_below(clusters, goal.rate, ceiling, goal.smallest)
         while len(clusters) > least:

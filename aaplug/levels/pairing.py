@@ -45,11 +45,6 @@ class Edges:
         """The pairs of several parts, at least one."""
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in ("one", "other", "cost")))
 
-    @classmethod
-    def none(cls, clusters: Clusters) -> "Edges":
-        """No pairs of these clusters."""
-        return cls(clusters.labels[:0], clusters.labels[:0], clusters.opacities[:0])
-
     def __len__(self) -> int:
         return len(self.cost)
 
@@ -91,7 +86,7 @@ def edges_below(
     smallest: px; those whose merged cluster is no larger count too.
     fresh: a pair needs one of these; None for all.
     """
-    parts = [Edges.none(clusters)]
+    parts = [Edges(clusters.labels[:0], clusters.labels[:0], clusters.opacities[:0])]
     ends = [torch.cat(pairs).split(PAIRS_PER_BATCH) for pairs in zip(*_neighbours(clusters, fresh), strict=True)]
     for one, other in zip(*ends, strict=True):
         cost = costs(clusters, one, other, rate, math.inf if smallest > 0 else tolerance)
