@@ -23,7 +23,7 @@ from torch import Tensor
 
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, read_bounded, read_part, text
+from aaplug.io.values import Entry, Place, entries, natural, object_of, parse_json, read_bounded, read_part, text, unit
 from aaplug.system.errors import FormatError
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, 0x4E4F534A, 0x004E4942
@@ -31,7 +31,6 @@ HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # by componentType
 FLOAT = 5126
-SHORTEST_TURN = 1e-6  # a shorter quaternion counts as no rotation
 
 
 @dataclass(frozen=True)
@@ -180,9 +179,8 @@ def at_rest(node: Entry) -> Float[Tensor, "4 4"]:
         return node.vector("matrix", 16).view(4, 4).T
     motion = torch.eye(4, dtype=torch.float64)
     if "rotation" in node:
-        turn = node.vector("rotation", 4)
-        node.place.expect(float(turn.norm()) > SHORTEST_TURN, "rotation", "not zero", turn.tolist())
-        motion[:3, :3] = rotation_matrices((turn / turn.norm()).roll(1)[None])[0]
+        quats = unit(node.vector("rotation", 4)[None], node.place)
+        motion[:3, :3] = rotation_matrices(quats.roll(1, dims=1))[0]
     if "scale" in node:
         motion[:3, :3] *= node.vector("scale", 3)
     if "translation" in node:

@@ -21,7 +21,6 @@ from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
 from aaplug.system.errors import FormatError, UsageError
 
-At = Callable[[tuple[int, int], Factors], Float[Tensor, "h w 3"]]
 Background = tuple[float, float, float]
 MAX_LEVEL = 255  # of 8 bits
 
@@ -36,7 +35,7 @@ class Photograph:
     """
 
     hw: tuple[int, int]
-    at: At
+    at: Callable[[tuple[int, int], Factors], Float[Tensor, "h w 3"]]
 
     def factors(self, view: Camera, scale: float) -> Factors:
         """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.

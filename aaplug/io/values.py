@@ -23,6 +23,7 @@ from aaplug.system.errors import FormatError, printable, reason
 Value = TypeVar("Value")
 
 HEAD_LIMIT = 64 * 2**10  # bytes searched for keys when a format is guessed
+MIN_LENGTH = 1e-6  # a shorter quaternion counts as no rotation
 MIN_FOCAL = 1e-6  # px: far below any real lens; what is computed from it stays finite
 
 
@@ -116,6 +117,14 @@ def natural(value: object, place: Place, field: str, most: int, least: int = 0, 
     right = least <= real <= most and real.is_integer()
     place.expect(right, field, f"a whole number{unit} from {least} to {most}", value)
     return int(real)
+
+
+def unit(quats: Float[Tensor, "n 4"], place: Place, field: str = "rotation") -> Float[Tensor, "n 4"]:
+    """Quaternions of length 1."""
+    lengths = quats.norm(dim=1, keepdim=True)
+    wrong = ~((lengths > MIN_LENGTH) & lengths.isfinite())[:, 0]  # squares of large numbers are infinite
+    place.expect(not wrong.any(), field, "finite and not zero", quats.tolist()[int(wrong.int().argmax())])
+    return quats / lengths
 
 
 def pixels(value: object, place: Place, field: str) -> int:

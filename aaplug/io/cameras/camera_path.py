@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred, numbered
-from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
+from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sets import CameraFileOptions, at_file_size, described_sizes, undivided
 from aaplug.io.values import entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError, counted
@@ -71,8 +71,7 @@ def path_of(path: Path, _: float | None = None) -> CameraPath:
         entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
         f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
         motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-        turn, centre = motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3]
-        cam_from_world = inverse(pose(turn, centre, entry.place, "camera_to_world"))
+        cam_from_world = inverse(pose(motion, entry.place, "camera_to_world", opengl=True))
         exact = {
             field: entry.get(key, number if key in ("cx", "cy") else focal)
             for key, field in EXACT.items()

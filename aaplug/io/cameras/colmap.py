@@ -11,16 +11,15 @@ from pathlib import Path
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, rigid_motion
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
-from aaplug.io.cameras.keyframes import unit
 from aaplug.io.cameras.photos import distinct, photo_folder, without_suffix
 from aaplug.io.cameras.poses import pose
 from aaplug.io.cameras.sets import CameraFileOptions
 from aaplug.io.lenses import PANORAMA, Distortion, panorama, with_lenses
-from aaplug.io.values import Place, focal, number, pixels
+from aaplug.io.values import Place, focal, number, pixels, unit
 from aaplug.system.errors import FormatError, listing
 
 SPLIT_LISTS = ("train_list.txt", "test_list.txt", "test.txt")  # nerfbaselines' and 3DGS's
@@ -92,7 +91,7 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics], photo: Path | None)
     translation = [number(value, image.place, "translation") for value in image.translation]
     quats = unit(torch.tensor([image.quaternion], dtype=torch.float64), image.place, "quaternion")
     turn = rotation_matrices(quats)[0]
-    cam_from_world = pose(turn, torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
+    cam_from_world = pose(rigid_motion(turn, torch.tensor(translation, dtype=torch.float64)), image.place, "quaternion")
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 
 

@@ -16,9 +16,9 @@ from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import keyframes
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, segments, slerp
-from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, pose
+from aaplug.io.cameras.poses import pose
 from aaplug.io.gltf import Gltf, at_rest
-from aaplug.io.values import Entry, Place, entries, natural, number, text
+from aaplug.io.values import Entry, Place, entries, natural, number, text, unit
 from aaplug.system.errors import FormatError
 
 PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}  # that move a camera
@@ -55,9 +55,8 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     motions = torch.eye(4, dtype=torch.float64).expand(len(at), 4, 4)
     for node in chain:
         motions = _local(nodes[node], channels.get(node, {}), at) @ motions
-    axes = motions[:, :3, :3] / motions[:, :3, :3].norm(dim=1, keepdim=True)
-    rows = zip(axes * OPENCV_FROM_OPENGL, motions[:, :3, 3], strict=True)
-    poses = torch.stack([pose(turn, where, place, "its transform") for turn, where in rows])
+    motions[:, :3, :3] /= motions[:, :3, :3].norm(dim=1, keepdim=True)
+    poses = torch.stack([pose(motion, place, "its transform", opengl=True) for motion in motions])
     camera = file.item("cameras", nodes[chosen], "camera")
     kind = camera.fields.get("type")
     camera.place.expect(kind == "perspective", "type", "perspective", kind)
@@ -106,7 +105,7 @@ def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -
     if "translation" in channels:
         motions[:, :3, 3] = _sampled(channels["translation"], at, node.place, False)
     if "rotation" in channels:
-        quats = keyframes.unit(_sampled(channels["rotation"], at, node.place, True), node.place)
+        quats = unit(_sampled(channels["rotation"], at, node.place, True), node.place)
         motions[:, :3, :3] = (
             rotation_matrices(quats.roll(1, dims=1)) @ motions[:, :3, :3]
         )  # that hold the scale at rest
@@ -126,7 +125,7 @@ def _sampled(channel: Channel, at: Float[Tensor, " f"], place: Place, turns: boo
     if way == "STEP":
         return values[torch.where(share < 1 - EVEN, index, after)]  # times are float32
     if turns:
-        values = keyframes.unit(values, place)
+        values = unit(values, place)
         return slerp(values[index], values[after], share)
     return values[index].lerp(values[after], share[:, None])
 

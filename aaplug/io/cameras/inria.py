@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet, centred, photographs
+from aaplug.core.cameras import Camera, CameraSet, centred, photographs, rigid_motion
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import sets
 from aaplug.io.cameras.photos import photo_folder, without_suffix
@@ -116,7 +116,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         rotation, position = item.matrix("rotation", 3, 3), item.vector("position", 3)
         size = item.get("width", pixels), item.get("height", pixels)
         fx, fy = item.get("fx", focal), item.get("fy", focal)
-        cam_from_world = inverse(pose(rotation, position, item.place, "rotation"))
+        cam_from_world = inverse(pose(rigid_motion(rotation, position), item.place, "rotation"))
         name = item.get("img_name", text)
         source.append(replace(centred(name, size, fx, cam_from_world, photos.find(name, item.place)), fy=fy))
     photos.check(source)

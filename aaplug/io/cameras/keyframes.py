@@ -16,7 +16,6 @@ from aaplug.io.values import Place, focal
 MAX_FRAMES = 10_000  # of a path file: 5 minutes and a half at 30 a second
 FPS = 30.0  # frames per second, where the file does not say
 UNSIZED = (1920, 1080)  # px: width and height, where the file does not say
-MIN_LENGTH = 1e-6  # a shorter quaternion counts as no rotation
 
 
 def frame_times(first: float, last: float, fps: float, place: Place) -> Float[Tensor, " f"]:
@@ -62,14 +61,6 @@ def slerp(first: Float[Tensor, "f 4"], last: Float[Tensor, "f 4"], share: Float[
     start = Rotation.from_quat(first.numpy())
     way = (start.inv() * Rotation.from_quat(last.numpy())).as_rotvec()
     return torch.from_numpy((start * Rotation.from_rotvec(share[:, None].numpy() * way)).as_quat())
-
-
-def unit(quats: Float[Tensor, "n 4"], place: Place, field: str = "rotation") -> Float[Tensor, "n 4"]:
-    """Quaternions of length 1."""
-    lengths = quats.norm(dim=1, keepdim=True)
-    wrong = ~((lengths > MIN_LENGTH) & lengths.isfinite())[:, 0]  # squares of large numbers are infinite
-    place.expect(not wrong.any(), field, "finite and not zero", quats.tolist()[int(wrong.int().argmax())])
-    return quats / lengths
 
 
 def cameras_of(

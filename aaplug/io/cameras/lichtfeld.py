@@ -12,9 +12,9 @@ import torch
 
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, rising, segments, slerp, unit
+from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, rising, segments, slerp
 from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL
-from aaplug.io.values import entries, mentions, number, object_of, read_json
+from aaplug.io.values import entries, mentions, number, object_of, read_json, unit
 
 LAST_VERSION = 4
 SENSOR_HEIGHT = 24.0  # mm

@@ -58,7 +58,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         height, width = (pixels(matrix[k, 4].item(), place, field) for k, field in enumerate(("height", "width")))
         f = focal(matrix[2, 4].item(), place, "focal length")
         down, right, back = matrix[:, :3].unbind(dim=1)
-        world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
+        world_from_cam = pose(torch.stack([right, down, -back, matrix[:, 3]], dim=1), place, "rotation")
         source.append(centred(last_part(name), (width, height), f, inverse(world_from_cam), folder.find(name, place)))
     folder.check(source)
     uneven = f"photos: {folder.folder.name} holds {photos} and the file {len(rows)} poses, so none is used"

@@ -14,10 +14,12 @@ from aaplug.io.values import Entry, Place
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # of the columns of camera-to-world rotations
 
 
-def pose(
-    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"], place: Place, field: str
-) -> Float[Tensor, "4 4"]:
-    """The rigid motion with this translation and the rotation nearest to `rotation`."""
+def pose(motion: Float[Tensor, "_ 4"], place: Place, field: str, opengl: bool = False) -> Float[Tensor, "4 4"]:
+    """The rigid motion nearest to `motion`, of which three rows count.
+
+    opengl: it is camera-to-world with OpenGL's axes of the camera (x right, y up, z backward).
+    """
+    rotation = motion[:3, :3] * (OPENCV_FROM_OPENGL if opengl else 1.0)
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if not error <= MAX_ROTATION_ERROR:
         off = f"R·Rᵀ is {error:.2g} off the identity, {MAX_ROTATION_ERROR:g} allowed"
@@ -25,7 +27,7 @@ def pose(
     if torch.linalg.det(rotation) <= 0:
         raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")
     left, _, right = torch.linalg.svd(rotation)
-    return rigid_motion(left @ right, translation)
+    return rigid_motion(left @ right, motion[:3, 3])
 
 
 def inverse(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -35,11 +37,8 @@ def inverse(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 
 def rigid(entry: Entry, field: str, opengl: bool = False) -> Float[Tensor, "4 4"]:
-    """The rigid motion of a field that holds a 4×4 matrix, whose last row is 0 0 0 1.
-
-    opengl: the matrix is camera-to-world with OpenGL's axes of the camera (x right, y up, z backward).
-    """
+    """The `pose` of a field that holds a 4×4 matrix, whose last row is 0 0 0 1."""
     motion = entry.matrix(field, 4, 4)
     right = torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3])
     entry.place.expect(right, f"{field}'s last row", "0 0 0 1", motion[3].tolist())
-    return pose(motion[:3, :3] * (OPENCV_FROM_OPENGL if opengl else 1.0), motion[:3, 3], entry.place, field)
+    return pose(motion, entry.place, field, opengl)

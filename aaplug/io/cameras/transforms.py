@@ -135,7 +135,7 @@ def _source(file: Path, options: CameraFileOptions) -> tuple[list[Camera], list[
         about = object_of(read_json(beside), beside, "it", "transform and scale")
         matrix, scale = about.matrix("transform", 3, 4), about.get("scale", number)
         about.place.expect(scale > 0, "scale", "above 0", scale)
-        parser = pose(matrix[:, :3], matrix[:, 3], about.place, "transform"), scale
+        parser = pose(matrix, about.place, "transform"), scale
     cameras = [_camera(*each, spare, parser) for each in zip(frames, photos, names, strict=True)]
     cameras, notes = with_lenses(cameras, [_distortion(frame) for frame in frames], options.undistort)
     if exported:

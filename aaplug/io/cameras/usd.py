@@ -16,7 +16,7 @@ import torch
 from aaplug.core.cameras import Aperture, Camera, Exposure, numbered
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import UNSIZED, frame_times
-from aaplug.io.cameras.poses import OPENCV_FROM_OPENGL, inverse, pose
+from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.values import Place, focal, number
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.extras import check_installed
@@ -111,9 +111,9 @@ def _camera(name: str, camera: Any, time: Any, place: Place) -> tuple[Camera, fl
     cy = height / 2 + value("VerticalApertureOffset") * rate
     rows = [list(row) for row in camera.ComputeLocalToWorldTransform(time)]
     motion = torch.tensor(rows, dtype=torch.float64).T
-    turn = motion[:3, :3] / motion[:3, :3].norm(dim=0) * OPENCV_FROM_OPENGL
-    place.expect(bool(motion.isfinite().all() and turn.isfinite().all()), "its transform", "finite", rows)
-    cam_from_world = inverse(pose(turn, motion[:3, 3], place, "its transform"))
+    motion[:3, :3] /= motion[:3, :3].norm(dim=0)
+    place.expect(bool(motion.isfinite().all()), "its transform", "finite", rows)
+    cam_from_world = inverse(pose(motion, place, "its transform", opengl=True))
     stop, focus = value("FStop"), value("FocusDistance")
     shutter = value("ShutterClose") - value("ShutterOpen")
     try:
