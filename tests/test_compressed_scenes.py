@@ -571,7 +571,7 @@ def test_time_and_memory_for_gltf_grow_with_the_file_alone(tmp_path: Path, monke
         monkeypatch.setattr(home, name, lambda *args, **kw: calls.update([name]) or function(*args, **kw))
 
     counting(base64, "b64decode")
-    counting(scene_gltf, "at_rest")
+    counting(scene_gltf, "local")
     counting(scene_gltf.spz, "parsed")
     write_scene(tmp_path / "a.gltf", make_scene(30))
     document = json.loads((tmp_path / "a.gltf").read_text())
@@ -579,7 +579,7 @@ def test_time_and_memory_for_gltf_grow_with_the_file_alone(tmp_path: Path, monke
     document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
     document["nodes"] = [{"mesh": 0, "children": [i + 1]} for i in range(20)] + [{"mesh": 0}]
     assert read_scene(write_json(tmp_path / "a.gltf", document)).count == 21 * 30
-    assert calls == {"b64decode": 1, "at_rest": 21}
+    assert calls == {"b64decode": 1, "local": 21}
     write_scene(tmp_path / "a.spz.glb", make_scene(30))
     whole = Gltf(tmp_path / "a.spz.glb")
     nodes = {**whole.root.fields, "nodes": [{"mesh": 0}] * 20}

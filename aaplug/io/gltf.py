@@ -8,7 +8,7 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -31,6 +31,7 @@ HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # by componentType
 FLOAT = 5126
+PARTS = {"translation": 3, "rotation": 4, "scale": 3}  # of a node's transform, with their numbers
 
 
 @dataclass(frozen=True)
@@ -173,19 +174,22 @@ class Gltf:
         return Buffer(file, size)
 
 
-def at_rest(node: Entry) -> Float[Tensor, "4 4"]:
-    """A node's own transform: its matrix, or its translation, rotation and scale."""
-    if "matrix" in node:
-        return node.vector("matrix", 16).view(4, 4).T
-    motion = torch.eye(4, dtype=torch.float64)
-    if "rotation" in node:
-        quats = unit(node.vector("rotation", 4)[None], node.place)
-        motion[:3, :3] = rotation_matrices(quats.roll(1, dims=1))[0]
-    if "scale" in node:
-        motion[:3, :3] *= node.vector("scale", 3)
-    if "translation" in node:
-        motion[:3, 3] = node.vector("translation", 3)
-    return motion
+def local(node: Entry, moved: Mapping[str, Float[Tensor, "f _"]]) -> Float[Tensor, "f 4 4"]:
+    """A node's own transforms: its matrix, or its translation, rotation and scale; one at rest.
+
+    moved: what an animation makes of these three at some times, by name.
+    """
+    if "matrix" in node and not moved:
+        return node.vector("matrix", 16).view(1, 4, 4).mT
+    parts = {name: node.vector(name, width)[None] for name, width in PARTS.items() if name in node} | {**moved}
+    motions = torch.eye(4, dtype=torch.float64).repeat(max(map(len, parts.values()), default=1), 1, 1)
+    if "rotation" in parts:
+        motions[:, :3, :3] = rotation_matrices(unit(parts["rotation"], node.place).roll(1, dims=1))
+    if "scale" in parts:
+        motions[:, :3, :3] *= parts["scale"][:, None]
+    if "translation" in parts:
+        motions[:, :3, 3] = parts["translation"]
+    return motions
 
 
 def glb_start(document: dict[str, Any], binary: int, room: int = 0) -> bytes:

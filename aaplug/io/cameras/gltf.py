@@ -12,16 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import keyframes
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import FPS, UNSIZED, cameras_of, frame_times, hermite, segments, slerp
 from aaplug.io.cameras.poses import pose
-from aaplug.io.gltf import Gltf, at_rest
+from aaplug.io.gltf import PARTS, Gltf, local
 from aaplug.io.values import Entry, Place, entries, natural, number, text, unit
 from aaplug.system.errors import FormatError
 
-PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}  # that move a camera
 MIN_RATE, MAX_RATE = 10.0, 240.0  # frames per second; sparser keys are no frames
 EVEN = 1e-3  # of the spacing between keys, which counts as rounding
 
@@ -54,7 +52,9 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
     at = frame_times(first, last, fps, place)
     motions = torch.eye(4, dtype=torch.float64).expand(len(at), 4, 4)
     for node in chain:
-        motions = _local(nodes[node], channels.get(node, {}), at) @ motions
+        own, tracks = nodes[node], channels.get(node, {})
+        moved = {part: _sampled(each, at, own.place, part == "rotation") for part, each in tracks.items()}
+        motions = local(own, moved) @ motions
     motions[:, :3, :3] /= motions[:, :3, :3].norm(dim=1, keepdim=True)
     poses = torch.stack([pose(motion, place, "its transform", opengl=True) for motion in motions])
     camera = file.item("cameras", nodes[chosen], "camera")
@@ -83,35 +83,19 @@ def _channels(file: Gltf) -> dict[int, dict[str, Channel]]:
         for channel in entries(file.path, "channel", animation.value("channels")):
             target = channel.entry("target")
             kind = target.fields.get("path")
-            if not isinstance(kind, str) or kind not in PATHS or "node" not in target:
+            if not isinstance(kind, str) or kind not in PARTS or "node" not in target:
                 continue
             node = natural(target.value("node"), target.place, "node", nodes - 1)
             sampler = samplers[natural(channel.value("sampler"), channel.place, "sampler", len(samplers) - 1)]
             times = file.numbers(sampler, "input", "SCALAR")[:, 0]
             keyframes.rising(times, sampler.place)
-            values, way = file.numbers(sampler, "output", PATHS[kind]), sampler.get("interpolation", text, "LINEAR")
+            values = file.numbers(sampler, "output", f"VEC{PARTS[kind]}")
+            way = sampler.get("interpolation", text, "LINEAR")
             sampler.place.expect(way in ("LINEAR", "STEP", "CUBICSPLINE"), "interpolation", "glTF's", way)
             rows = len(times) * (3 if way == "CUBICSPLINE" else 1)
             sampler.place.expect(len(values) == rows, "output", f"{rows} values", len(values))
             found.setdefault(node, {}).setdefault(kind, (times, values, way))
     return found
-
-
-def _local(node: Entry, channels: dict[str, Channel], at: Float[Tensor, " f"]) -> Float[Tensor, "f 4 4"]:
-    """A node's own motion at these times."""
-    hidden = {"matrix", *channels} if channels else ()
-    own = Entry(node.place, {key: value for key, value in node.fields.items() if key not in hidden})
-    motions = at_rest(own).repeat(len(at), 1, 1)
-    if "translation" in channels:
-        motions[:, :3, 3] = _sampled(channels["translation"], at, node.place, False)
-    if "rotation" in channels:
-        quats = unit(_sampled(channels["rotation"], at, node.place, True), node.place)
-        motions[:, :3, :3] = (
-            rotation_matrices(quats.roll(1, dims=1)) @ motions[:, :3, :3]
-        )  # that hold the scale at rest
-    if "scale" in channels:
-        motions[:, :3, :3] *= _sampled(channels["scale"], at, node.place, False)[:, None]
-    return motions
 
 
 def _sampled(channel: Channel, at: Float[Tensor, " f"], place: Place, turns: bool) -> Float[Tensor, "f c"]:

@@ -47,9 +47,8 @@ def path_of(path: Path, fps: float | None = None) -> CameraPath:
         angles.fill_(about.entry("camera").get("fov", number, FOV))
     places = (columns.vector(key, 3 * n).view(n, 3) for key in ("position", "target"))
     values = torch.cat([*places, angles[:, None]], dim=1)
-    times = rising(
-        keys.vector("times", n) * (1 if "frameRate" in track else rate), about.place
-    )  # early files count times in s
+    frames_per_time = 1.0 if "frameRate" in track else rate  # early files count times in s
+    times = rising(keys.vector("times", n) * frames_per_time, about.place)
     fps = fps or rate
     at = frame_times(0.0, frames * (fps / rate) - 1, 1.0, about.place) * (rate / fps)
     inside = times < frames

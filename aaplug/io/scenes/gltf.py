@@ -26,7 +26,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.atomic import replacing, write_file
-from aaplug.io.gltf import FLOAT, MAGIC, Gltf, Table, at_rest, glb_start
+from aaplug.io.gltf import FLOAT, MAGIC, Gltf, Table, glb_start, local
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.packed import Piece, bytes_of, half_turn_about_z, in_a_row, logit_of, replacing_group, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
@@ -120,7 +120,7 @@ def _primitives(document: Gltf) -> Iterator[tuple[Entry, Entry, Float[Tensor, "4
     nodes = document.items("nodes")
     motions: dict[int | None, Float[Tensor, "4 4"]] = {None: torch.eye(4, dtype=torch.float64)}
     for index, above in document.parents.items():
-        motions[index] = motions[above] @ at_rest(nodes[index])
+        motions[index] = motions[above] @ local(nodes[index], {})[0]
     holders = [(index, node) for index, node in enumerate(nodes) if "mesh" in node]
     places = [(document.item("meshes", node, "mesh"), motions[index]) for index, node in holders]
     for mesh, motion in places or [(mesh, motions[None]) for mesh in document.items("meshes")]:
