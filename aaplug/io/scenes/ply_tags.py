@@ -108,26 +108,22 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
 
 
 def _from_others(header: Header, mode: str | None, two_scales: bool) -> tuple[str, Convention]:
-    """The evidence of others' tags and columns, and the convention that they state."""
-    postshot = _last(header, POSTSHOT_TAG)
-    if FILTER_COLUMN in header.vertex.codes:
-        return f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused", MIP
-    if mode is not None and mode.lower() == FLAT_MODE:
-        return f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic", CLASSIC
-    if mode is None and two_scales:
-        return "two scales in the file: 2D Gaussians (2DGS), treated as classic", CLASSIC
-    if mode is not None and mode.lower() in MODES:
-        lost = f"; {KERNEL_LOST}" if mode.lower() == "mip" else ""
-        return f"tag in the file: SplatRenderMode: {mode}{lost}", MODES[mode.lower()]
-    if mode is not None:
-        return f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic", CLASSIC
-    if postshot is not None:
-        return f"tag in the file: antialiased {postshot}", ANTIALIASED if postshot == "1" else CLASSIC
-    if has_camera(header):
-        return "tables of SHARP in the file: its renderer adds nothing to a splat", KHR
-    if _matches(header, NERFSTUDIO):
-        return f"{UNTAGGED}nerfstudio writes none, it may be classic or antialiased; assumed classic", CLASSIC
-    return f"{UNTAGGED}assumed classic (3DGS default)", CLASSIC
+    """The evidence of others' tags and columns, and the convention that they state: the first that is there."""
+    postshot, nerfstudio, word = _last(header, POSTSHOT_TAG), _matches(header, NERFSTUDIO), (mode or "").lower()
+    lost, tag = f"; {KERNEL_LOST}" if word == "mip" else "", f"tag in the file, SplatRenderMode: {mode}"
+    filtered, camera = FILTER_COLUMN in header.vertex.codes, has_camera(header)
+    sources = [
+        (filtered, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused", MIP),
+        (word == FLAT_MODE, f"{tag}: 2D Gaussians, treated as classic", CLASSIC),
+        (mode is None and two_scales, "two scales in the file: 2D Gaussians (2DGS), treated as classic", CLASSIC),
+        (word in MODES, f"tag in the file: SplatRenderMode: {mode}{lost}", MODES.get(word, CLASSIC)),
+        (mode is not None, f"{tag}, is unknown: assumed classic", CLASSIC),
+        (postshot is not None, f"tag in the file: antialiased {postshot}", ANTIALIASED if postshot == "1" else CLASSIC),
+        (camera, "tables of SHARP in the file: its renderer adds nothing to a splat", KHR),
+        (nerfstudio, f"{UNTAGGED}nerfstudio writes none, it may be classic or antialiased; assumed classic", CLASSIC),
+        (True, f"{UNTAGGED}assumed classic (3DGS default)", CLASSIC),
+    ]
+    return next((evidence, convention) for there, evidence, convention in sources if there)
 
 
 def _matches(header: Header, pattern: re.Pattern[str]) -> list[str]:
