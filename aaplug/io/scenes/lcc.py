@@ -59,7 +59,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         index, data, *harmonics = (beside[each] for each in names)
         ends = partial(_ends, path, {each.get("name", text): each for each in attributes})
         kinds = ("scale", "shcoef") if degree else ("scale",)
-        pieces = _pieces(index, data, harmonics[0] if degree else data, levels, ends(kinds))
+        pieces = _pieces(index, data, harmonics[0] if degree else data, levels, degree, ends(kinds))
         far = FAR_RECORD if degree else RECORD
         if (sky := beside.get("environment.bin")) and sky.stat().st_size:
             count, rest = divmod(sky.stat().st_size, far.itemsize)
@@ -97,7 +97,7 @@ def _ends(path: Path, attributes: dict[str, Entry], wanted: Sequence[str]) -> li
     return [torch.stack([each.vector("min", 3), each.vector("max", 3)]).float() for each in found]
 
 
-def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Tensor]) -> list[Piece]:
+def _pieces(index: Path, data: Path, harmonics: Path, levels: int, degree: int, ends: list[Tensor]) -> list[Piece]:
     """Records of the finest level, part of space by part."""
     entry = np.dtype([("part", "<u4"), ("levels", LEVEL, (levels,))])
     held = read_bounded(index, whole_limit("JSON"))
@@ -105,7 +105,7 @@ def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Te
         raise FormatError(index, f"has {len(held):,} bytes, not a multiple of {entry.itemsize} for {levels} levels")
     finest = np.frombuffer(held, entry)["levels"][:, 0]
     size = data.stat().st_size
-    whole = min(size, harmonics.stat().st_size // 2) if len(ends) > 1 else size
+    whole = min(size, harmonics.stat().st_size // 2) if degree else size
     counts, starts, sizes = (finest[key].astype(np.uint64) for key in ("count", "start", "size"))
     wrong = (sizes != counts * RECORD.itemsize) | (starts > size) | (sizes > whole - np.minimum(starts, whole))
     if wrong.any() or sizes.sum() > size:
@@ -114,5 +114,5 @@ def _pieces(index: Path, data: Path, harmonics: Path, levels: int, ends: list[Te
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         read = partial(read_rows, data, RECORD, offset=start)
         read_harmonics = partial(read_rows, harmonics, HARMONICS, offset=2 * start)
-        found.append(Piece(count, 3 * (len(ends) > 1), partial(_load, read, read_harmonics, ends)))
+        found.append(Piece(count, degree, partial(_load, read, read_harmonics, ends)))
     return found
