@@ -95,14 +95,6 @@ def _drop_output() -> None:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
-def _check_current_folder() -> None:
-    """Refuse a folder that was removed, where torch ends the program with a line about its libraries."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        raise UsageError("current folder", f"cannot be used: {reason(error)}; change to another") from error
-
-
 def run(words: Sequence[str]) -> int:
     """Run one verb with its options; returns the exit code."""
     from . import console
@@ -113,7 +105,10 @@ def run(words: Sequence[str]) -> int:
         with command.errors("aaplug"):
             with _printing():  # --help
                 given = command.parse(words[1:])
-            _check_current_folder()
+            try:
+                os.getcwd()
+            except OSError as error:  # it was removed, where torch ends the program with a line about its libraries
+                raise UsageError("current folder", f"cannot be used: {reason(error)}; change to another") from error
             several = given.values.get("batch") is not None  # then each scene's are checked with its file
             answer = command.run(given if several else given.checked())
         code = FAILED if answer.failed else 0

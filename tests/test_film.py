@@ -15,7 +15,7 @@ from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
-from aaplug.options.verbs import FilmOptions
+from aaplug.options.verbs import ImageOptions
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
 from tests.conftest import make_camera, make_scene
@@ -250,28 +250,28 @@ def test_sizes_take_the_exposure_along():
 
 def test_the_shutter_is_open_around_each_frame_at_the_mean_speed_there():
     path = [make_camera((x, -4.0, 0.0)) for x in (0.0, 0.4, 1.2)]
-    views = filmed(path, FilmOptions(shutter=0.5), True)
+    views = filmed(path, ImageOptions(shutter=0.5), True)
     places = [[camera.centre[0].item() for camera in view.exposure.motion] for view in views]
     assert [x for pair in places for x in pair] == pytest.approx([-0.1, 0.1, 0.25, 0.55, 1.0, 1.4])
-    assert filmed(path, FilmOptions(), True) == path
+    assert filmed(path, ImageOptions(), True) == path
 
 
 def test_a_frame_on_a_curve_lies_in_the_middle_of_its_motion():
     angles = (0.0, 0.3, 0.6)  # rad around the origin, with a zoom that turns back
     zooms = zip((make_camera((4 * math.sin(a), 4 * math.cos(a), 0.0)) for a in angles), (1.0, 1.5, 1.0), strict=True)
     path = [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera, zoom in zooms]
-    for view in filmed(path, FilmOptions(shutter=1.0), True):
+    for view in filmed(path, ImageOptions(shutter=1.0), True):
         middle = toward(*view.exposure.motion, 0.5)
         torch.testing.assert_close(middle.cam_from_world, view.cam_from_world, rtol=0, atol=1e-3)
         assert middle.intrinsics == pytest.approx(view.intrinsics)
 
 
 def test_an_f_stop_is_the_focal_length_over_the_diameter():
-    [view] = filmed([VIEW], FilmOptions(f_stop=2.0, sensor=0.1, focus_at=(0.0, 0.0, 0.0), blades=5), False)
+    [view] = filmed([VIEW], ImageOptions(f_stop=2.0, sensor=0.1, focus_at=(0.0, 0.0, 0.0), blades=5), False)
     assert view.exposure.aperture.radius == pytest.approx(0.1 * VIEW.fx / VIEW.width / 2 / 2)
     assert (view.exposure.aperture.focus, view.exposure.aperture.blades) == (pytest.approx(4.0), 5)
     assert view.exposure.samples == 16
-    fast = filmed([VIEW], FilmOptions(f_stop=2.0, focus_distance=1.0, quality="fast"), False)
+    fast = filmed([VIEW], ImageOptions(f_stop=2.0, focus_distance=1.0, quality="fast"), False)
     assert fast[0].exposure.samples == 5
 
 
@@ -292,14 +292,14 @@ WRONG = {
 def test_wrong_options_are_refused(case):
     options, path, says = WRONG[case]
     with pytest.raises(UsageError, match=says):
-        filmed([VIEW], FilmOptions(**options), path)
+        filmed([VIEW], ImageOptions(**options), path)
 
 
 def test_a_lens_that_bends_moves_but_has_no_aperture():
     panorama = replace(VIEW, lens=Lens("equirect"), fx=10.0, fy=10.0)
     for bent, got in ((panorama, "got equirect"), (replace(VIEW, lens=Lens(radial=(0.1,))), "got a distorted pinhole")):
         with pytest.raises(UsageError, match=f"f_stop: an aperture needs .* distortion, {got}; give `lens` pinhole"):
-            filmed([bent], FilmOptions(f_stop=2.0, focus_distance=1.0), False)
+            filmed([bent], ImageOptions(f_stop=2.0, focus_distance=1.0), False)
     renderer = aaplug.Renderer.of(make_scene(30), [VIEW], "matched", min_seen=0.0)
     moving = replace(
         panorama, exposure=Exposure(None, (panorama, replace(panorama, cam_from_world=MOVED.cam_from_world)), 4)
@@ -309,7 +309,7 @@ def test_a_lens_that_bends_moves_but_has_no_aperture():
 
 def test_a_camera_to_is_one_view_for_one():
     with pytest.raises(UsageError, match=r"camera_to: names one view, for one of `views` .*; got 1 view for 2 views"):
-        filmed([VIEW, VIEW], FilmOptions(), False, camera_to=[MOVED])
+        filmed([VIEW, VIEW], ImageOptions(), False, camera_to=[MOVED])
 
 
 @pytest.mark.parametrize(
@@ -322,9 +322,9 @@ def test_a_camera_to_is_one_view_for_one():
 )
 def test_a_motion_has_a_length_and_keeps_size_and_kind_of_lens(end, says):
     with pytest.raises(UsageError, match=f"camera_to.*{says}"):
-        filmed([VIEW], FilmOptions(), False, camera_to=[end])
+        filmed([VIEW], ImageOptions(), False, camera_to=[end])
     with pytest.raises(UsageError, match=f"shutter.*{says}"):
-        filmed([VIEW, end], FilmOptions(shutter=0.5), True)
+        filmed([VIEW, end], ImageOptions(shutter=0.5), True)
 
 
 def test_through_a_fisheye_of_another_aspect_pixels_are_square_and_a_stretched_view_is_told(cli, monkeypatch):
@@ -363,15 +363,15 @@ def test_a_path_file_brings_its_aperture_and_shutter(tmp_path):
     path["camera_path"] = [{**f, "aperture": {"radius": 0.02, "focus": 3, "blades": 7}} for f in (frame, moved)]
     (tmp_path / "path.json").write_text(json.dumps(path))
     file = read_camera_path(tmp_path / "path.json")
-    views = filmed(file.cameras, FilmOptions(samples=4), True, file.shutter)
+    views = filmed(file.cameras, ImageOptions(samples=4), True, file.shutter)
     assert views[0].exposure.aperture == Aperture(0.02, 3.0, 7)
     assert views[0].exposure.motion is not None
     assert views[0].exposure.samples == 4
-    assert filmed(file.cameras, FilmOptions(samples=0), True, file.shutter)[0].exposure is None
+    assert filmed(file.cameras, ImageOptions(samples=0), True, file.shutter)[0].exposure is None
     for still in (views[:1], views[:1] * 2):  # the file's shutter, but no motion
-        assert filmed(still, FilmOptions(samples=4), True, file.shutter)[0].exposure.motion is None
+        assert filmed(still, ImageOptions(samples=4), True, file.shutter)[0].exposure.motion is None
     bare = replace(views[0], exposure=None)
-    assert filmed([bare], FilmOptions(samples=4), True, file.shutter) == [bare]
+    assert filmed([bare], ImageOptions(samples=4), True, file.shutter) == [bare]
     how = {"path": tmp_path / "path.json", "lens": "equirect", "resolution": "16x8", "min_seen": 0.0}
     scene, cameras = make_scene(20), CameraSet((VIEW,), (VIEW,))
     with pytest.raises(UsageError, match=r"lens: an aperture .*; `samples` of 0 leaves out that of"):

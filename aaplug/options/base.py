@@ -152,8 +152,11 @@ def number(
 class Options:
     """The options of a verb; a subclass is a dataclass of this kind without being decorated.
 
+    Its `_rules` refuse options that contradict each other, after those of its bases.
+
     Raises:
-        UsageError: a value is not of its option's type, a number is outside of its range, or a name is not known.
+        UsageError: a value is not of its option's type, a number is outside of its range, a name is not known, or a
+            rule does not hold.
     """
 
     monitor: Annotated[Monitor, PYTHON_ONLY] = SILENT
@@ -166,6 +169,9 @@ class Options:
         for name, argument in _checks(type(self)).items():
             argument.check(name, getattr(self, name))
         check_fields(self)
+        for base in reversed(type(self).__mro__):
+            if "_rules" in vars(base):
+                vars(base)["_rules"](self)
 
     def need(self, holds: bool, problem: str, *names: str) -> None:
         """Refuse options that are not as usual, unless a condition holds; raises UsageError."""

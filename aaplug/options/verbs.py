@@ -154,8 +154,8 @@ class RecipeOptions(ViewOptions):
         return {"quality": self.quality, "rate_reference": self.rate_reference or "pose", "order": self.order}
 
 
-class ImageOptions(Options):
-    """Images by one recipe at one size."""
+class ImageOptions(RecipeOptions):
+    """Images by one recipe at one size, through an aperture, a shutter and a lens."""
 
     recipe: OneRecipe = "auto"
     """How to render; `aaplug recipes` lists them all."""
@@ -177,15 +177,6 @@ class ImageOptions(Options):
     """Values of colours: srgb, as a display takes them, or linear in light (default: srgb; .exr: linear)."""
     bit_depth: Annotated[Literal[8, 16, 32] | None, names(8, 16, 32), FILES] = None
     """Bits per channel (default: 8; .exr: 16, half precision, but 32 where a pass needs it; .npz: 32)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.need(self.resolution is None, "sets the size, as `resolution` does; give one", "scale")
-
-
-class FilmOptions(RecipeOptions):
-    """Aperture and shutter."""
-
     f_stop: Annotated[float | None, number(0.01, 1000), FILM] = None
     """Focal length over the aperture's diameter, such as 2.8; a smaller one defocuses more."""
     sensor: Annotated[float | None, number(1e-9, 1e9, metavar="WIDTH"), FILM] = None
@@ -200,20 +191,6 @@ class FilmOptions(RecipeOptions):
     """Time that the shutter is open, as a share of the time between frames; 0.5 is usual in film."""
     samples: Annotated[int | None, number(0, 4096, whole=True, metavar="N"), FILM] = None
     """Frames averaged to one (default: 16, or 5 with --quality fast); 0 ignores a path file's aperture and shutter."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.need(self.focus_at is None, "sets the focus, as `focus_at` does; give one", "focus_distance")
-        focused = self.focus_distance is not None or self.focus_at is not None
-        self.need(focused, "is an aperture without focus; give `focus_distance` or `focus_at`", "f_stop")
-        of_aperture = ("sensor", "focus_distance", "focus_at", "blades")
-        self.need(self.f_stop is not None, "belongs to `f_stop`", *of_aperture)
-        self.need(self.samples != 0, "is ignored by `samples` of 0; give one of the two", "f_stop", "shutter")
-
-
-class LensOptions(Options):
-    """The lens."""
-
     lens: Annotated[str | None, names("pinhole", "fisheye", "equisolid", "equirect", "vr180", "ortho"), LENS] = None
     """Draw through another lens (default: that of the camera); equirect is 360x180 degrees, vr180 a pair of eyes."""
     lens_angle: Annotated[float, number(1, 360, metavar="DEGREES"), LENS] = HALF_TURN
@@ -221,8 +198,14 @@ class LensOptions(Options):
     eye_distance: Annotated[float | None, number(0, MAX_COORDINATE, metavar="UNITS"), LENS] = None
     """Distance between the eyes of vr180, in the scene's units."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
+        self.need(self.resolution is None, "sets the size, as `resolution` does; give one", "scale")
+        self.need(self.focus_at is None, "sets the focus, as `focus_at` does; give one", "focus_distance")
+        focused = self.focus_distance is not None or self.focus_at is not None
+        self.need(focused, "is an aperture without focus; give `focus_distance` or `focus_at`", "f_stop")
+        of_aperture = ("sensor", "focus_distance", "focus_at", "blades")
+        self.need(self.f_stop is not None, "belongs to `f_stop`", *of_aperture)
+        self.need(self.samples != 0, "is ignored by `samples` of 0; give one of the two", "f_stop", "shutter")
         if (self.eye_distance is None) == (self.lens == "vr180"):
             raise UsageError("eye_distance", "belongs to lens vr180, which needs it: about 0.064 m in scene units")
         has_angle = self.lens in ("fisheye", "equisolid")
@@ -249,8 +232,7 @@ class Orbit(Options):
     train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), ORBIT] = None
     """Instead, training's px per world unit in the middle of the scene."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.train_rate is None, "sets the training rate, as `train_rate` does; give one", "train_view")
         self.need(self.eye is None, "moves the camera along an orbit, and `eye` is one place", "orbit", "elevation")
 
@@ -264,7 +246,7 @@ class WritingOptions(Options):
     """Replace existing outputs."""
 
 
-class RenderOptions(FilmOptions, ImageOptions, LensOptions):
+class RenderOptions(ImageOptions):
     """Rendering."""
 
     path: Annotated[AnyPath | None, flag("FILE", read=as_path)] = None
@@ -272,13 +254,12 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
     """For one view: the view that the camera reaches while the shutter is open."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.path is None, "are replaced by `path`; give one of the two", "views")
         self.need(self.samples != 0, "opens a shutter, which `samples` of 0 ignores; give one of the two", "camera_to")
 
 
-class VideoOptions(FilmOptions, ImageOptions, LensOptions):
+class VideoOptions(ImageOptions):
     """Rendering, and the camera path."""
 
     scale: Annotated[float | None, SCALE] = None
@@ -300,8 +281,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     first_frame: Annotated[int, number(0, MOST_FIRST_FRAME, whole=True, metavar="N"), FILES] = 1
     """Number of a frame sequence's first frame, such as 1001."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         for paths, of_them in ((RECEDING_PATHS, ("start", "end")), (BUILT_IN_PATHS, ("seconds", "views"))):
             self.need(str(self.path) in paths, f"is for the paths {listing(paths)}, not for {self.path}", *of_them)
         is_right = str(self.path) != "zoom" or self.lens in ("pinhole", "ortho")
@@ -342,8 +322,7 @@ class EvaluateOptions(RecipeOptions):
     overwrite: bool = False
     """Replace existing results."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.report, "selects views of the report; give `report`, too", "show")
 
 
@@ -367,8 +346,7 @@ class CompareOptions(RecipeOptions):
     overwrite: bool = False
     """Replace existing results."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.viewer is None, "is set by `viewer`; give one of the two", "recipe")
 
 
@@ -386,8 +364,7 @@ class ConvertOptions(WritingOptions, ViewOptions):
     variance: Annotated[float | None, number(0.001, 100)] = None
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.viewer is None, "is set by `viewer`; give one of the two", "form", "variance")
         self.need(self.viewer is not None, "belongs to the fit to a viewer; name one with `viewer`", "steps")
 
@@ -437,8 +414,7 @@ class LodOptions(WritingOptions, ViewOptions):
     resume: bool = False
     """Keep the levels that are there, if they were made of the same scene, cameras and options."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
@@ -500,8 +476,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     resume: bool = False
     """Continue an interrupted run from its checkpoint."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _rules(self) -> None:
         self.need(self.method == USUAL_METHOD, f"is a method of its own, beside {self.method}", "learn_filters")
 
 

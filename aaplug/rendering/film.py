@@ -8,7 +8,7 @@ import torch
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
 from aaplug.core.lenses import PINHOLE
-from aaplug.options.verbs import DEFAULT_SENSOR, FilmOptions
+from aaplug.options.verbs import DEFAULT_SENSOR, ImageOptions
 from aaplug.system.errors import UsageError, counted
 
 SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6
@@ -16,7 +16,7 @@ SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the
 
 def filmed(
     views: Sequence[Camera],
-    options: FilmOptions,
+    options: ImageOptions,
     path: bool,
     shutter: float | None = None,
     camera_to: Sequence[Camera] = (),
@@ -75,7 +75,7 @@ def filmed(
     return [replace(view, exposure=exposure) for view, exposure in zip(views, exposures, strict=True)]
 
 
-def _aperture(view: Camera, options: FilmOptions) -> Aperture | None:
+def _aperture(view: Camera, options: ImageOptions) -> Aperture | None:
     """The aperture that the options give the view, or else its own."""
     if options.f_stop is None:
         return view.exposure and view.exposure.aperture

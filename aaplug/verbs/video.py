@@ -109,7 +109,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         return side_by_side(images, labels, rate, min(views[index].hw) / min(path.cameras[index].hw))
 
     path_file = [] if file is None else [str(options.path)]
-    place = target if sequence is None else sequence.folder
+    place = target if sequence is None else sequence.pattern.parent
     with running(options, place, check, [*job.inputs, *path_file], folder=sequence is not None) as workers:
         look = job.look(len(views) * len(recipes))
         renderers = [look.by(recipe) for recipe in recipes]

@@ -190,22 +190,17 @@ class FrameSequence:
         return cls(output)
 
     @property
-    def folder(self) -> Path:
-        """Folder of the frames."""
-        return self.pattern.parent
-
-    @property
     def paths(self) -> list[Path]:
         """The frames' files, in order."""
         [places] = PLACES.findall(self.pattern.name)
         numbers = (f"{number:0{len(places)}d}" for number in range(self.first, self.first + self.count))
-        return [self.folder / PLACES.sub(number, self.pattern.name) for number in numbers]
+        return [self.pattern.parent / PLACES.sub(number, self.pattern.name) for number in numbers]
 
     @property
     def record(self) -> Path:
         """File of what was asked for."""
         name = PLACES.sub("", self.pattern.stem).strip(SEPARATORS)
-        return self.folder / f"{name or 'frames'}.json"
+        return self.pattern.parent / f"{name or 'frames'}.json"
 
     def check(self, overwrite: bool, resume: bool) -> None:
         """Refuse, before any work, frames that exist unless `overwrite` or `resume` is set, and further ones."""
@@ -214,11 +209,11 @@ class FrameSequence:
         files = [*self.paths, self.record]
         before, after = PLACES.split(self.pattern.name)
         numbered = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}", re.ASCII)
-        found = sorted(p.name for p in self.folder.iterdir()) if self.folder.is_dir() else []
-        further = [name for name in found if numbered.fullmatch(name) and self.folder / name not in files]
+        found = sorted(p.name for p in self.pattern.parent.iterdir()) if self.pattern.parent.is_dir() else []
+        further = [name for name in found if numbered.fullmatch(name) and self.pattern.parent / name not in files]
         if further:
             problem = f"holds {listing(further, most=3)} beside the {counted(self.count, 'frame')}; remove them"
-            raise OutputError(self.folder, problem)
+            raise OutputError(self.pattern.parent, problem)
         refuse_existing(files, overwrite, resume)
         if resume and not self.record.exists() and any(path.exists() for path in self.paths):
             raise OutputError(self.record, "does not exist, which says what the frames show; pass `overwrite`")
