@@ -1,17 +1,100 @@
-"""Views with the aperture and the shutter that options ask for, checked before anything is drawn."""
+"""Views with the lens, size, aperture and shutter that options ask for, checked before anything is drawn."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
-from aaplug.core.camera_paths import toward
+from aaplug.core.camera_paths import median_depth, toward
 from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
-from aaplug.core.lenses import PINHOLE
-from aaplug.options.verbs import DEFAULT_SENSOR, ImageOptions
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
+from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.options.verbs import DEFAULT_SENSOR, ImageOptions, check_side, size_of
+from aaplug.rendering.job import Job
 from aaplug.system.errors import UsageError, counted
 
+STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6
+
+
+def drawn(job: Job[ImageOptions], path: CameraPath | None, ends: Sequence[Camera] = ()) -> list[list[Camera]]:
+    """The cameras of each eye: two for vr180, else one; with the lens, size and exposure that a job's options ask for.
+
+    path: frames of one motion; None for the job's views.  ends: where the shutter closes, see `filmed`.
+    """
+    moves, path = path is not None, path or CameraPath(job.views, unsized=job.cameras.assumed)
+    cameras, count = path.cameras, 2 if job.options.lens == "vr180" else 1
+    if moves and job.scene.frames is not None:  # a scene in time passes once
+        moments = len(job.scene.frames)
+        cameras = [replace(view, frame=i * moments // len(cameras)) for i, view in enumerate(cameras)]
+    views, ends = (_seen(job, each, path.unsized) for each in (cameras, ends))
+    eyes = [(views[eye::count], ends[eye::count]) for eye in range(count)]
+    return [filmed(eye_views, job.options, moves, path.shutter, eye_ends) for eye_views, eye_ends in eyes]
+
+
+def _seen(job: Job[ImageOptions], views: Sequence[Camera], unsized: bool) -> list[Camera]:
+    """The views through the lens and at the size that a job's options ask for; with vr180 of both eyes in turn.
+
+    unsized: pixels stay square where a resolution changes the aspect, as they do through a lens that shows its angle
+        along the shorter side.
+
+    Raises UsageError if an image would be larger than `MAX_SIDE`.
+    """
+    options = job.options
+    views = [replace(view, exposure=None) for view in views] if options.samples == 0 else views
+    if options.lens not in (None, "pinhole") and any(view.exposure and view.exposure.aperture for view in views):
+        raise UsageError("lens", f"{NEEDS_PINHOLE}; `samples` of 0 leaves out that of the path file")
+    bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
+    if options.resolution is None:
+        sized = [view.scaled(options.scale or 1.0) for view in bent]
+    else:
+        sizes = [size_of(options.resolution, shape=(view.width, view.height)) for view in bent]
+        square = unsized or options.lens in ("fisheye", "equisolid", "ortho")
+        sized = [(v.framed if square else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
+        stretched = [v for v, by in zip(sized, bent, strict=True) if abs(v.fx / by.fx * by.fy / v.fy - 1) > STRETCH]
+        if stretched and "-1" not in options.resolution:
+            what = f"{stretched[0].width}x{stretched[0].height} px stretches view {stretched[0].name}"
+            job.monitor.say(f"resolution: {what}; -1 on one side keeps its aspect")
+    for view in sized:
+        check_side(view.name, view.width, view.height)
+    return sized
+
+
+def _through_lens(job: Job[ImageOptions], view: Camera) -> list[Camera]:
+    """The view through the lens that the options name, with pixels as dense at the image's centre.
+
+    Ortho shows things at the scene's median depth as large as the view does, a fisheye its angle along the shorter
+    side, equirect all around, vr180 half of that by two eyes, of which the names say left and right.
+    """
+    options = job.options
+    half, side = math.radians(options.lens_angle) / 2, min(view.hw)
+    if options.lens == "pinhole":
+        return [replace(view, lens=PINHOLE)]
+    if options.lens == "ortho":
+        factor = 1 / median_depth(job.scene.gaussians().means, view)
+        return [replace(view, lens=ORTHO, fx=view.fx * factor, fy=view.fy * factor, trained_focal=None)]
+    if options.lens in ("fisheye", "equisolid"):
+        lens = EQUIDISTANT if options.lens == "fisheye" else EQUISOLID
+        focal = side / 2 / (half if lens == EQUIDISTANT else 2 * math.sin(half / 2))
+        lens = replace(lens, max_angle=min(180.0, math.degrees(half)))
+        return [_centred(view, lens, view.width, view.height, focal)]
+    height = 2 * round(math.pi * view.focal / 2)
+    if options.lens == "equirect":
+        return [_centred(view, EQUIRECT, 2 * height, height, height / math.pi)]
+    eyes = []
+    for name, sign in (("left", 1), ("right", -1)):
+        eye = _centred(view, replace(EQUIRECT, max_angle=90.0), height, height, height / math.pi)
+        pose = eye.cam_from_world.clone()
+        pose[0, 3] += sign * (options.eye_distance or 0.0) / 2
+        eyes.append(replace(eye, name=f"{view.name}-{name}", cam_from_world=pose))
+    return eyes
+
+
+def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) -> Camera:
+    """A free camera in the view's place, with its principal point in the middle."""
+    size = {"width": width, "height": height, "cx": width / 2, "cy": height / 2, "fx": focal, "fy": focal}
+    return replace(view, lens=lens, **size, trained_focal=None, photo=None)
 
 
 def filmed(

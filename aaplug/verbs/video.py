@@ -14,13 +14,14 @@ from torch import Tensor
 
 from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, digest_of_cameras
-from aaplug.evaluation.report.contact_sheet import labelled, magnified
+from aaplug.evaluation.report.contact_sheet import side_by_side
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_image
 from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
+from aaplug.rendering.film import drawn
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
@@ -28,10 +29,9 @@ from aaplug.system.errors import UsageError, counted, listing
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.verb import AnyPath, SceneLike, writes
-from aaplug.verbs.views import FrameSequence, drawn, storage_of
+from aaplug.verbs.views import FrameSequence, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
-PANE_GAP = 4  # px
 MAX_FRAMES = 100_000
 SEQUENCE = "name a sequence, such as frames/frame.####.exr"
 IN_VIDEO = {  # what a video can hold of the options of image files
@@ -177,20 +177,3 @@ def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
         return camera_paths.frames(lambda t: camera_paths.moved(view, rate(t), depth), count)
     up = camera_paths.up_of(job.cameras)
     return camera_paths.frames(partial(camera_paths.orbit, view, depth=depth, up=up), count)
-
-
-def side_by_side(
-    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str], rate: float = 1.0, size: float = 1.0
-) -> Float[Tensor, "h w 3"]:
-    """Images from left to right, each with its label; a single image stays as it is.
-
-    rate: size of things against the data set's view; where it falls, the middle is also shown enlarged.
-    size: of the images, relative to the training size.
-    """
-    if len(images) == 1:
-        return images[0]
-    caption = f"{rate * size:.2f} of training's sampling, {{times}}x"
-    insets = [magnified(image, min(1.0, rate), caption) for image in images]
-    panes = [labelled(image, label) for image, label in zip(insets, labels, strict=True)]
-    gap = torch.zeros(panes[0].shape[0], PANE_GAP, 3)
-    return torch.cat([part for pane in panes for part in (gap, pane)][1:], dim=1)

@@ -1,7 +1,6 @@
-"""Sizes of rendered views, and the files they go to: checked here, before any work."""
+"""The files that rendered views go to, checked before any work."""
 
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,109 +8,24 @@ from pathlib import Path
 from typing import Any, TypeVar
 from unicodedata import normalize
 
-from aaplug.core.camera_paths import median_depth
-from aaplug.core.cameras import NEEDS_PINHOLE, Camera
+from aaplug.core.cameras import Camera
 from aaplug.core.colours import BLACK
-from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
 from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, write_file
-from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.io.video import CODECS
-from aaplug.options.verbs import RenderOptions, VideoOptions, check_side, size_of
-from aaplug.rendering.film import filmed
-from aaplug.rendering.job import Job
+from aaplug.options.verbs import RenderOptions, VideoOptions
 from aaplug.system.errors import START_AGAIN, FormatError, OutputError, UsageError, counted, listing
 from aaplug.verbs.verb import RESUME_OR_OVERWRITE
 
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif", *CODECS)  # any other name is a folder
 Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
-STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 DEVICE = re.compile("con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)  # no file on Windows, whatever its suffix
 PLACES = re.compile("#+")  # of a frame's number in a name
 SEPARATORS = "._-"  # between it and the rest
 USUAL_NAME = "frame.####"  # in a folder
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
-
-
-def drawn(job: Job[Drawn], path: CameraPath | None, ends: Sequence[Camera] = ()) -> list[list[Camera]]:
-    """The cameras of each eye: two for vr180, else one; with the lens, size and exposure that a job's options ask for.
-
-    path: frames of one motion; None for the job's views.  ends: where the shutter closes, see `filmed`.
-    """
-    moves, path = path is not None, path or CameraPath(job.views, unsized=job.cameras.assumed)
-    cameras, count = path.cameras, 2 if job.options.lens == "vr180" else 1
-    if moves and job.scene.frames is not None:  # a scene in time passes once
-        moments = len(job.scene.frames)
-        cameras = [replace(view, frame=i * moments // len(cameras)) for i, view in enumerate(cameras)]
-    views, ends = (_seen(job, each, path.unsized) for each in (cameras, ends))
-    eyes = [(views[eye::count], ends[eye::count]) for eye in range(count)]
-    return [filmed(eye_views, job.options, moves, path.shutter, eye_ends) for eye_views, eye_ends in eyes]
-
-
-def _seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
-    """The views through the lens and at the size that a job's options ask for; with vr180 of both eyes in turn.
-
-    unsized: pixels stay square where a resolution changes the aspect, as they do through a lens that shows its angle
-        along the shorter side.
-
-    Raises UsageError if an image would be larger than `MAX_SIDE`.
-    """
-    options = job.options
-    views = [replace(view, exposure=None) for view in views] if options.samples == 0 else views
-    if options.lens not in (None, "pinhole") and any(view.exposure and view.exposure.aperture for view in views):
-        raise UsageError("lens", f"{NEEDS_PINHOLE}; `samples` of 0 leaves out that of the path file")
-    bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
-    if options.resolution is None:
-        sized = [view.scaled(options.scale or 1.0) for view in bent]
-    else:
-        sizes = [size_of(options.resolution, shape=(view.width, view.height)) for view in bent]
-        square = unsized or options.lens in ("fisheye", "equisolid", "ortho")
-        sized = [(v.framed if square else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
-        stretched = [v for v, by in zip(sized, bent, strict=True) if abs(v.fx / by.fx * by.fy / v.fy - 1) > STRETCH]
-        if stretched and "-1" not in options.resolution:
-            what = f"{stretched[0].width}x{stretched[0].height} px stretches view {stretched[0].name}"
-            job.monitor.say(f"resolution: {what}; -1 on one side keeps its aspect")
-    for view in sized:
-        check_side(view.name, view.width, view.height)
-    return sized
-
-
-def _through_lens(job: Job[Drawn], view: Camera) -> list[Camera]:
-    """The view through the lens that the options name, with pixels as dense at the image's centre.
-
-    Ortho shows things at the scene's median depth as large as the view does, a fisheye its angle along the shorter
-    side, equirect all around, vr180 half of that by two eyes, of which the names say left and right.
-    """
-    options = job.options
-    half, side = math.radians(options.lens_angle) / 2, min(view.hw)
-    if options.lens == "pinhole":
-        return [replace(view, lens=PINHOLE)]
-    if options.lens == "ortho":
-        factor = 1 / median_depth(job.scene.gaussians().means, view)
-        return [replace(view, lens=ORTHO, fx=view.fx * factor, fy=view.fy * factor, trained_focal=None)]
-    if options.lens in ("fisheye", "equisolid"):
-        lens = EQUIDISTANT if options.lens == "fisheye" else EQUISOLID
-        focal = side / 2 / (half if lens == EQUIDISTANT else 2 * math.sin(half / 2))
-        lens = replace(lens, max_angle=min(180.0, math.degrees(half)))
-        return [_centred(view, lens, view.width, view.height, focal)]
-    height = 2 * round(math.pi * view.focal / 2)
-    if options.lens == "equirect":
-        return [_centred(view, EQUIRECT, 2 * height, height, height / math.pi)]
-    eyes = []
-    for name, sign in (("left", 1), ("right", -1)):
-        eye = _centred(view, replace(EQUIRECT, max_angle=90.0), height, height, height / math.pi)
-        pose = eye.cam_from_world.clone()
-        pose[0, 3] += sign * (options.eye_distance or 0.0) / 2
-        eyes.append(replace(eye, name=f"{view.name}-{name}", cam_from_world=pose))
-    return eyes
-
-
-def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) -> Camera:
-    """A free camera in the view's place, with its principal point in the middle."""
-    size = {"width": width, "height": height, "cx": width / 2, "cy": height / 2, "fx": focal, "fy": focal}
-    return replace(view, lens=lens, **size, trained_focal=None, photo=None)
 
 
 def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:

@@ -22,6 +22,7 @@ from aaplug.rendering.renderer import Renderer
 
 CELL_HEIGHT = 320  # px
 GAP = 12  # px
+PANE_GAP = 4  # px: between images side by side
 HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
 LIGHT_INK = (245, 245, 245)
@@ -89,6 +90,23 @@ def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> F
     error = (levels(image, 8) - levels(truth, 8)).abs().amax(dim=2).cpu().numpy()
     stops, shades = np.linspace(0, ERROR_FULL, len(HEAT)), np.array(HEAT) / BYTE
     return torch.from_numpy(np.stack([np.interp(error, stops, shade) for shade in shades.T], axis=2)).float()
+
+
+def side_by_side(
+    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str], rate: float = 1.0, size: float = 1.0
+) -> Float[Tensor, "h w 3"]:
+    """Images from left to right, each with its label; a single image stays as it is.
+
+    rate: size of things against the data set's view; where it falls, the middle is also shown enlarged.
+    size: of the images, relative to the training size.
+    """
+    if len(images) == 1:
+        return images[0]
+    caption = f"{rate * size:.2f} of training's sampling, {{times}}x"
+    insets = [magnified(image, min(1.0, rate), caption) for image in images]
+    panes = [labelled(image, label) for image, label in zip(insets, labels, strict=True)]
+    gap = torch.zeros(panes[0].shape[0], PANE_GAP, 3)
+    return torch.cat([part for pane in panes for part in (gap, pane)][1:], dim=1)
 
 
 def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
