@@ -88,12 +88,13 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], is_made: Callab
 
     suffix: of a scene's output.  is_made: whether a scene's output is there, and complete.
     """
+    from aaplug.evaluation.data_sets import status_table
     from aaplug.evaluation.report.files import as_json, write_texts
     from aaplug.io.atomic import refuse_existing
+    from aaplug.io.image_files import file_names
     from aaplug.io.scenes.pyramid_folder import is_pyramid
     from aaplug.rendering.job import running
-    from aaplug.verbs.batch import SUMMARY, status_table
-    from aaplug.verbs.views import file_names
+    from aaplug.verbs.batch import SUMMARY
 
     scenes = dict(scenes_of(words.batch, words.where(batch=None, resume=False, scheduler=None)))
     folder = next(iter(scenes.values())).output

@@ -11,8 +11,8 @@ import pytest
 from aaplug_cli.main import main
 
 from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.image_files import file_names
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.views import file_names
 from tests.conftest import exit_code, make_camera
 
 WORDS = "video scene.ply --cameras . --scale 0.5 --seconds 0.2 -o"

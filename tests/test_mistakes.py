@@ -15,9 +15,9 @@ from aaplug_cli.main import main
 from rich.console import Console
 
 from aaplug import read_cameras, write_scene
+from aaplug.evaluation.data_sets import status_table
 from aaplug.evaluation.results import Report, grid
 from aaplug.system.errors import FormatError, printable
-from aaplug.verbs.batch import status_table
 from tests.conftest import exit_code, make_scene
 
 LONG = "n" * 300

@@ -11,7 +11,7 @@ n: Gaussians, m: pairs.
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from statistics import median
@@ -29,9 +29,11 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.evaluation.alignment import PAIR_DISTANCE, mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Report, literal, mean, spread_of, tables
+from aaplug.io.image_files import file_names
+from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.columns import usable
 from aaplug.io.scenes.scene import Scene
-from aaplug.system.errors import FrameError
+from aaplug.system.errors import FrameError, UsageError
 
 GUARDED = (
     "the lowest, over later scenes and scales, of the mean PSNR of views whose images differ, in dB; null if none do"
@@ -129,6 +131,23 @@ class ComparedScene:
         if found := facts["differences"]:
             facts["differences"] = found | found.pop("changes")
         return facts
+
+
+def named_scenes(scenes: Mapping[str, SceneLike] | Sequence[SceneLike]) -> dict[str, Scene]:
+    """The scenes by name, opened; without names they get those of their files, numbered where two are the same.
+
+    Raises UsageError if there are fewer than two.
+    """
+    opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
+    if len(opened) < 2:
+        problem = f"needs two scenes or more, got {len(opened)}; the others are compared with the first"
+        raise UsageError("compare", problem)
+    if isinstance(scenes, Mapping):
+        return dict(zip(scenes, opened, strict=True))
+    titles = [scene.title for scene in opened]
+    longer = [f"{s.file.parent.name}/{name}" if s.file else name for name, s in zip(titles, opened, strict=True)]
+    names = longer if len(set(titles)) < len(set(longer)) == len(longer) else titles
+    return dict(zip(file_names(names, "scene", 1), opened, strict=True))
 
 
 def in_one_frame(scenes: Mapping[str, Scene], say: Say = lambda text: None) -> dict[str, Scene]:

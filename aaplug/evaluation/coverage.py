@@ -12,7 +12,7 @@ A survey gathers the same of a file, with other statistics, part by part in boun
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -28,6 +28,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import counted
 from aaplug.system.monitor import Tell
 
 BINS = 48
@@ -35,6 +36,10 @@ SPECTRUM_VIEWS = 3  # from which the energy above the Nyquist rate is taken
 LOWEST_LOG2, HIGHEST_LOG2 = -7.0, 5.0  # of extent over bound; the end bins of the histogram count what lies outside
 PROBE_ROWS = 64  # Gaussians read at each place of the file
 SURVEY_BINS = 4096  # of a histogram
+USUAL_LOG_SCALE = 20.0  # larger ones are taken for scales
+MIN_JUDGED = 10  # Gaussians: of fewer, all values may lie as activated ones do
+MIN_STEPS = 1e4  # of float32 across the scene's extent: with fewer, positions are coarse
+ULP = 2.0**-23  # of float32, relative
 NEEDLE_RATIO = 10.0  # longest axis over the middle one, from which a Gaussian is a needle
 
 
@@ -180,6 +185,29 @@ def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda do
             found.under += int((multiples < 0).sum())
         tell(found.count, opened.count)
     return found
+
+
+def problems(scene: Scene, statistics: Survey) -> Iterator[str]:
+    """Yield what is odd about the scene, each with what to do."""
+    for text, number in statistics.faults.items():
+        yield f"{counted(number, 'Gaussian')} with {text}: --drop-bad leaves such out"
+    if not scene.count:
+        yield "the scene is empty: check that it is the right file"
+    if not statistics.count:
+        return
+    judged = max(statistics.count, MIN_JUDGED)
+    if statistics.largest > USUAL_LOG_SCALE or statistics.above_zero == judged:
+        yield "scales look already exponentiated (they should be logarithms): export the scene again"
+    elif statistics.activated == judged:
+        yield "opacities look already activated, all in [0, 1] (they should be logits): export the scene again"
+    if statistics.filtered:
+        yield "its filter_3D is not fused, and viewers ignore it: `aaplug convert` fuses it"
+    if scene.flat:
+        yield "2D Gaussians: recipe auto draws them as discs, as 2DGS does; no viewer of `aaplug viewers` does"
+    farthest = max(statistics.low.abs().max().item(), statistics.high.abs().max().item())
+    extent = (statistics.high - statistics.low).max().item()
+    if 0 < extent < MIN_STEPS * ULP * farthest:
+        yield f"lies {farthest:.3g} from the origin, where float32 is coarse: centre it before training"
 
 
 def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from aaplug.evaluation.results import Measurement
-from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import FormatError, OutputError, UsageError, listing, reason
+from aaplug.system.digests import check_request, digest_of_values
+from aaplug.system.errors import FormatError, OutputError, UsageError, reason
 from aaplug.system.locks import lock
 
 JOURNAL = "progress.jsonl"
@@ -96,23 +96,6 @@ class Journal:
                 self.views[line["view"]] = tuple(Measurement(**each) for each in line["measurements"])
             stack.pop_all()  # the stream stays open
             self._stream = stream
-
-
-def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], anew: str) -> None:
-    """Refuse to continue what was asked for otherwise; path: where that is written.  anew: how to start again."""
-    if changed := [*_changes(before, now)]:
-        what = f"is of another request or another aaplug ({listing(changed)} changed since)"
-        raise UsageError(str(path), f"{what}; repeat that request, or {anew}")
-
-
-def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
-    """The keys whose values differ; those of mappings with that of the mapping, such as `versions.torch`."""
-    for key in dict.fromkeys((*now, *before)):
-        old, new = before.get(key), now.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            yield from (f"{key}.{inner}" for inner in _changes(old, new))
-        elif old != new:
-            yield key
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:

@@ -17,7 +17,7 @@ from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference, SplatOrder
 from aaplug.options.base import PYTHON_ONLY, Group, Options, as_path, flag, names, number
 from aaplug.system.contracts import LazyType
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, listing
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, RESUME_OR_OVERWRITE, UsageError, listing
 from aaplug.system.registry import names_of, spelt
 
 if TYPE_CHECKING:  # the modules of these types import torch
@@ -284,6 +284,7 @@ class VideoOptions(ImageOptions):
     def _rules(self) -> None:
         for paths, of_them in ((RECEDING_PATHS, ("start", "end")), (BUILT_IN_PATHS, ("seconds", "views"))):
             self.need(str(self.path) in paths, f"is for the paths {listing(paths)}, not for {self.path}", *of_them)
+        self.need(not self.overwrite, RESUME_OR_OVERWRITE, "resume")
         is_right = str(self.path) != "zoom" or self.lens in ("pinhole", "ortho")
         self.need(
             is_right, f"{self.lens} sets its own angle, which zoom would change; give `path` dolly or orbit", "lens"

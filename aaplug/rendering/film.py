@@ -1,21 +1,46 @@
-"""Views with the lens, size, aperture and shutter that options ask for, checked before anything is drawn."""
+"""Views with the lens, size, aperture and shutter that options ask for, and how their images are stored.
+
+All is checked before anything is drawn.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
 
 import torch
 
 from aaplug.core.camera_paths import median_depth, toward
 from aaplug.core.cameras import NEEDS_PINHOLE, Aperture, Camera, Exposure
+from aaplug.core.colours import BLACK
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
 from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.image_formats import Storage
 from aaplug.options.verbs import DEFAULT_SENSOR, ImageOptions, check_side, size_of
 from aaplug.rendering.job import Job
 from aaplug.system.errors import UsageError, counted
 
+Drawn = TypeVar("Drawn", bound=ImageOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6
+
+
+def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
+    """How images are stored, and the options; those for images with alpha have no background.
+
+    Raises UsageError if the format does not hold what is asked for, or there is to be a background and alpha or no rgb.
+    """
+    passes = [options.passes] if isinstance(options.passes, str) else options.passes
+    stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)
+    storage = Storage.of(output, options.format, passes, *stored)
+    if options.background != "auto" and "rgb" not in storage.passes:
+        raise UsageError("background", "is of the pass rgb, which `passes` leaves out")
+    if "alpha" not in storage.passes:
+        return storage, options
+    if options.background != "auto":
+        raise UsageError("background", "is not stored where alpha is; leave one of them out")
+    return storage, replace(options, background=BLACK)
 
 
 def drawn(job: Job[ImageOptions], path: CameraPath | None, ends: Sequence[Camera] = ()) -> list[list[Camera]]:

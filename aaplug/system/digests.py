@@ -1,4 +1,4 @@
-"""Hashes (SHA-256, in hex) of what a result depends on, so that a continued run can tell whether anything changed."""
+"""What a result depends on, as hashes (SHA-256, in hex), so that a continued run can tell whether anything changed."""
 
 import hashlib
 import re
@@ -6,12 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from os import PathLike
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
-from aaplug.system.errors import FormatError, reason
+from aaplug.system.errors import FormatError, UsageError, listing, reason
 
 MEMORY_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")  # in `repr` of a function, and of an object without one of its own
 
@@ -78,3 +79,20 @@ def _texts(value: Any, above: frozenset[int]) -> Iterator[bytes]:
         yield _text(value)
     for part in parts:
         yield from _texts(part, above | {id(value)})
+
+
+def check_request(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], anew: str) -> None:
+    """Refuse to continue what was asked for otherwise; path: where that is written.  anew: how to start again."""
+    if changed := [*_changes(before, now)]:
+        what = f"is of another request or another aaplug ({listing(changed)} changed since)"
+        raise UsageError(str(path), f"{what}; repeat that request, or {anew}")
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """The keys whose values differ; those of mappings with that of the mapping, such as `versions.torch`."""
+    for key in dict.fromkeys((*now, *before)):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from (f"{key}.{inner}" for inner in _changes(old, new))
+        elif old != new:
+            yield key

@@ -16,6 +16,8 @@ from types import FrameType
 from unicodedata import category
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
+RESUME_OR_OVERWRITE = "continues a run, and `overwrite` starts anew; give one"
+IS_COMPLETE = "is of a run that is complete: nothing is left to resume; `overwrite` starts anew"
 START_AGAIN = "start again with `overwrite`, not `resume`"  # where what is there cannot be continued
 SPACE = "Zs"  # Unicode's category of spaces, such as the ideographic one
 VOWELS = tuple("aeiou")  # that a word begins with which takes "an"

@@ -2,117 +2,27 @@
 
 import json
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import fmean
-from typing import Any, TypeVar
-
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
+from typing import TypeVar
 
 from aaplug.evaluation import PROTOCOLS
-from aaplug.evaluation.data_sets import Paper, data_set_of, paper
+from aaplug.evaluation.data_sets import Batch, data_set_of
 from aaplug.evaluation.journal import JOURNAL
-from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, remove_run, write_texts
-from aaplug.evaluation.results import Report, as_csv, literal, method, metric_grid, results
+from aaplug.evaluation.results import Report, as_csv
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs, writing
+from aaplug.io.image_files import file_names
 from aaplug.system.contracts import contract
-from aaplug.system.errors import AaplugError, ClusterError, counted, within_memory
+from aaplug.system.errors import AaplugError, ClusterError, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
-from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS, TABLE = "batch.json", "results.csv", "table.tex"
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Outcomes of the scenes, by the names of their folders: a report, or in words why there is none.
-
-    protocol: of a data set, whose scenes these are; then there are no means unless all have finished.
-    partly: give the means of those that have finished all the same.
-    """
-
-    names: Mapping[str, str]
-    reports: Mapping[str, Report]
-    failures: Mapping[str, str]
-    protocol: Protocol | None = None
-    partly: bool = False
-
-    @property
-    def whole(self) -> bool:
-        """True if means may be taken."""
-        return bool(self.reports) and (self.protocol is None or self.partly or not self.failures)
-
-    def papers(self) -> list[Paper]:
-        """Of a data set, a table for each metric as papers print it."""
-        if self.protocol is None or not self.whole:
-            return []
-        named = {self.names[folder]: report for folder, report in self.reports.items()}
-        first = next(iter(self.reports.values()))
-        return [paper(self.protocol, named, metric) for metric in first.compared]
-
-    def summary(self) -> dict[str, Any]:
-        """Status of every scene, and means over the finished ones of what all of them measured; JSON-ready."""
-        scenes = {folder: {"name": name, "status": "done"} for folder, name in self.names.items()}
-        for folder, error in self.failures.items():
-            scenes[folder] |= {"status": "failed", "error": error}
-        over = list(self.reports) if self.whole else []
-        return {"scenes": scenes, "mean_over": over, "mean": self._means() if self.whole else {}}
-
-    def _means(self) -> dict[str, dict[str, float | None]]:
-        """By method and metric; None where a scene has no value, or one by another protocol: such do not compare."""
-        first, *others = reports = [*self.reports.values()]
-        figures, means = [results(report) for report in reports], dict[str, dict[str, float | None]]()
-        unlike = {m.name for m in first.metrics if any(r.basis(m.name) != first.basis(m.name) for r in others)}
-        for name in figures[0]:
-            if name != "_aaplug" and all(name in each for each in figures):
-                values = {key: [each[name].get(key) for each in figures] for key in figures[0][name]}
-                lacking = unlike | {key for key, each in values.items() if None in each}
-                means[name] = {key: None if key in lacking else fmean(each) for key, each in values.items()}
-        return means
-
-    def tables(self) -> list[Table | str]:
-        """The means, one table per metric, and the status of every scene."""
-        whys = [(name, self.failures.get(folder, "")) for folder, name in self.names.items()]
-        scenes = status_table("why", [(name, "failed" if why else "done", why) for name, why in whys])
-        if not self.whole:
-            return [scenes]
-        if self.protocol is not None:
-            printed = list[Table | str]()
-            for paper in self.papers():
-                table = Table(title=escape(paper.title), title_justify="left")
-                for i, heading in enumerate(paper.headings):
-                    table.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-                for row in paper.rows:
-                    table.add_row(*(Text(cell.replace(" ±", "\n±")) for cell in row))
-                printed.append(table)
-            return [*printed, scenes]
-        first, means, grids = next(iter(self.reports.values())), self._means(), list[Table | str]()
-        over = f"mean of {counted(len(self.reports), 'scene')}"
-        for metric in first.metrics:
-            values = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
-            lines = [[metric.text(value) for value in line] for line in values]
-            grids += metric_grid(f"{metric.title}, {over}", [*self.reports.values()], metric, lines)
-        return [*grids, scenes]
-
-
-def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:
-    """A table of the scenes: name, status, and a text under the heading."""
-    table = Table(title="scenes", title_justify="left")
-    for column in ("scene", "status", heading):
-        table.add_column(column, overflow="fold")
-    for name, status, text in rows:
-        status = "[red]failed[/]" if status == "failed" else status
-        table.add_row(literal(name), status, literal(text))
-    return table
 
 
 @contract

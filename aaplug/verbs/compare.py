@@ -1,12 +1,11 @@
 """Scenes against the first of them: what compression, conversion, pruning or training again costs, at every size."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from aaplug.evaluation import PROTOCOLS
-from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
+from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame, named_scenes
 from aaplug.evaluation.engine import Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import JOURNAL
@@ -16,17 +15,13 @@ from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, remove_run, 
 from aaplug.evaluation.results import as_csv
 from aaplug.evaluation.truth import Truth
 from aaplug.io.images import write_png
-from aaplug.io.scenes import scene_of
-from aaplug.io.scenes.scene import Scene
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import find_viewer
 from aaplug.options.verbs import COMPARED_SCALES, CompareOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
 from aaplug.verbs.evaluate import check_journalled
 from aaplug.verbs.verb import AnyPath, ScenesLike, compares
-from aaplug.verbs.views import file_names
 
 SOURCE = "the first scene as its recipe draws it at each size"
 PROTOCOL = replace(PROTOCOLS["self"], name="compare", source=SOURCE, scales=COMPARED_SCALES)
@@ -51,8 +46,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     check = partial(check_compared, folder, options.resume, options.overwrite, options.show)
     check()
     metrics, say = find_metrics(options.metric, PROTOCOL), options.monitor.say
-    named = _named(scenes)
-    named = in_one_frame(named, say)
+    named = in_one_frame(named_scenes(scenes), say)
     job = Job.of(next(iter(named.values())), cameras, options)
     named = in_one_frame(named | {next(iter(named)): job.scene}, say)  # whose reading cameras may have told
     rows = compared_scenes(named, options.any_frame, say)
@@ -108,17 +102,3 @@ def check_compared(folder: Path | None, resume: bool, overwrite: bool, show: str
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
     seen = show != CompareOptions.show
     check_journalled(folder, (*COMPARED, PAGE), "a comparison", resume, overwrite, show=seen)
-
-
-def _named(scenes: ScenesLike) -> dict[str, Scene]:
-    """The scenes by name, opened; without names they get those of their files, numbered where two are the same."""
-    opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
-    if len(opened) < 2:
-        problem = f"needs two scenes or more, got {len(opened)}; the others are compared with the first"
-        raise UsageError("compare", problem)
-    if isinstance(scenes, Mapping):
-        return dict(zip(scenes, opened, strict=True))
-    titles = [scene.title for scene in opened]
-    longer = [f"{s.file.parent.name}/{name}" if s.file else name for name, s in zip(titles, opened, strict=True)]
-    names = longer if len(set(titles)) < len(set(longer)) == len(longer) else titles
-    return dict(zip(file_names(names, "scene", 1), opened, strict=True))

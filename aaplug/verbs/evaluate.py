@@ -19,8 +19,8 @@ from aaplug.io.atomic import AnyPath, check_name, refuse_existing
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import OutputError, UsageError, counted
-from aaplug.verbs.verb import RESUME_OR_OVERWRITE, SceneLike, writes
+from aaplug.system.errors import RESUME_OR_OVERWRITE, OutputError, UsageError, counted
+from aaplug.verbs.verb import SceneLike, writes
 
 
 @writes(EvaluateOptions)

@@ -37,9 +37,9 @@ from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import OutputError, UsageError, counted, listing
+from aaplug.system.errors import IS_COMPLETE, OutputError, UsageError, counted, listing
 from aaplug.system.monitor import Monitor
-from aaplug.verbs.verb import IS_COMPLETE, writes
+from aaplug.verbs.verb import writes
 
 
 @dataclass(frozen=True)

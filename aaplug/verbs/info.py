@@ -1,31 +1,25 @@
 """Facts of a scene: its convention and why, what is fused, what is odd."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.coverage import Survey, above_nyquist, aliasing_begins, check_frame_of, survey
+from aaplug.evaluation.coverage import above_nyquist, aliasing_begins, check_frame_of, problems, survey
 from aaplug.evaluation.results import scale_name
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
-from aaplug.io.scenes.scene import Scene
 from aaplug.methods.conversion import described_fusions
 from aaplug.options.verbs import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of, up_evidence
 from aaplug.rendering.job import CamerasLike, Job
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError, counted
+from aaplug.system.errors import UsageError
 from aaplug.verbs.verb import looks
 
-MAX_LOG_SCALE = 20.0  # larger ones are taken for scales
-MIN_JUDGED = 10  # Gaussians: of fewer, all values may lie as activated ones do
-MIN_STEPS = 1e4  # of float32 across the scene's extent: with fewer, positions are coarse
 PICTURE_SIDES = (3840, 1920, 1280, 640, 320)  # px: longer sides of pictures of the whole scene
 SPECTRUM_ROWS = 20  # Gaussians read at each place of the file, of which the splats' energy is taken
 SPECTRUM_RECIPES, SPECTRUM_SCALES = ("classic", "matched", "auto"), (1.0, 1 / 2, 1 / 4, 1 / 8)
-ULP = 2.0**-23  # of float32, relative
 
 
 @looks(FrameOptions)
@@ -109,27 +103,4 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
             "cameras": list(job.cameras.notes),
             "energy_above_nyquist_share": above,
         }
-    return facts | {"problems": list(_problems(opened, statistics))}
-
-
-def _problems(scene: Scene, statistics: Survey) -> Iterator[str]:
-    """Yield what is odd about the scene, each with what to do."""
-    for text, number in statistics.faults.items():
-        yield f"{counted(number, 'Gaussian')} with {text}: --drop-bad leaves such out"
-    if not scene.count:
-        yield "the scene is empty: check that it is the right file"
-    if not statistics.count:
-        return
-    judged = max(statistics.count, MIN_JUDGED)
-    if statistics.largest > MAX_LOG_SCALE or statistics.above_zero == judged:
-        yield "scales look already exponentiated (they should be logarithms): export the scene again"
-    elif statistics.activated == judged:
-        yield "opacities look already activated, all in [0, 1] (they should be logits): export the scene again"
-    if statistics.filtered:
-        yield "its filter_3D is not fused, and viewers ignore it: `aaplug convert` fuses it"
-    if scene.flat:
-        yield "2D Gaussians: recipe auto draws them as discs, as 2DGS does; no viewer of `aaplug viewers` does"
-    farthest = max(statistics.low.abs().max().item(), statistics.high.abs().max().item())
-    extent = (statistics.high - statistics.low).max().item()
-    if 0 < extent < MIN_STEPS * ULP * farthest:
-        yield f"lies {farthest:.3g} from the origin, where float32 is coarse: centre it before training"
+    return facts | {"problems": list(problems(opened, statistics))}

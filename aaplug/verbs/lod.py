@@ -1,10 +1,9 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count, takewhile
 from pathlib import Path
@@ -12,45 +11,31 @@ from pathlib import Path
 import torch
 
 from aaplug.core.camera_paths import up_of
-from aaplug.core.cameras import Camera, digest_of_cameras
+from aaplug.core.cameras import digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.convolution import fuse_stored
-from aaplug.core.gaussians import Gaussians, digest_of_scene, joined
+from aaplug.core.gaussians import digest_of_scene
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Level
 from aaplug.core.sampling import check_frame, median_rates
-from aaplug.core.training import TrainingViews
-from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.finetuning.refining import refine, refine_tree
+from aaplug.finetuning.level_maker import DEFAULT_LEVELS, LevelMaker
+from aaplug.finetuning.refining import refine_tree
 from aaplug.io import StreamName, streamed
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
-from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
 from aaplug.io.scenes import SceneLike, check_scene_output, pyramid_folder, write_scene, written_format
-from aaplug.io.scenes.columns import columns_of
 from aaplug.io.scenes.ply import beside
 from aaplug.io.scenes.pyramid_folder import MANIFEST
-from aaplug.io.scenes.scene import FLOAT, Scene
-from aaplug.io.streamed import STREAMS, Front
-from aaplug.levels.clusters import rates_of
-from aaplug.levels.merging import TOLERANCE, Goal, merge
-from aaplug.methods.conversion import fuse_for
-from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
+from aaplug.io.scenes.scene import Scene
+from aaplug.io.streamed import STREAMS
+from aaplug.methods.viewers import MIP_VIEWER
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.assumed import PROBE_ROWS
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import Renderer, own_look
-from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_files, digest_of_values
-from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
-from aaplug.verbs.verb import IS_COMPLETE, writes
+from aaplug.system.errors import IS_COMPLETE, FormatError, OutputError, UsageError, counted
+from aaplug.verbs.verb import writes
 
-DEFAULT_LEVELS = 4  # down to 1/16 of the training size
-MEGABYTE = 1e6
-# At most, of the header of a .ply: the records of merging and tuning, and what it says of a column.
-RECORDS_BYTES, COLUMN_BYTES = 1500, 24
-SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
 MERGING_RULE = 4  # raised when merging or tuning changes, so that levels of two rules are not mixed
-NORMAL_COLUMNS = 3  # that a .ply has beside a Gaussian's parameters
 
 
 @writes(LodOptions)
@@ -85,9 +70,9 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     if lost := beside(whole):
         job.monitor.say(f"{whole.name}: merged Gaussians do not have its {lost}")
     with running(options, path, check, job.inputs, folder=not options.single):
-        maker = _Maker.of(whole, job)
+        maker = LevelMaker.of(whole, job)
         if options.single:
-            lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
+            lighter = maker.finished(maker(Level(whole, 1.0), maker.goals[0]))
             if path is not None:
                 how = (maker.viewer or MIP_VIEWER).spz(options.spz_axes)
                 write_scene(path, lighter.scene, overwrite=options.overwrite, **how)
@@ -101,136 +86,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
         return levels
 
 
-@dataclass(frozen=True, eq=False)
-class _Maker:
-    """Makes a level of the one before it.
-
-    look: draws the scene as training showed it; None where levels are neither tuned nor merged by visibility.
-    views: to tune on, and to merge by; none to merge by where nobody knows the cameras.
-    viewer: whose rule each file is tuned for; levels for aaplug are made of tuned ones.
-    """
-
-    scene: Gaussians
-    job: Job[LodOptions]
-    look: Renderer | None
-    views: Sequence[Camera]
-    viewer: Viewer | None
-
-    @classmethod
-    def of(cls, scene: Gaussians, job: Job[LodOptions]) -> "_Maker":
-        """The maker that the options ask for."""
-        viewer = find_viewer(job.options.viewer or (job.options.to and STREAMS[job.options.to].viewer))
-        if scene.flat and viewer is not None:
-            raise UsageError(scene.name, "holds 2D Gaussians, whose levels only aaplug draws; leave out `viewer`, `to`")
-        if scene.flat and job.options.tuning:
-            job.monitor.say("2D Gaussians are merged alone: they have no fast gradients to tune by")
-        if job.cameras.assumed and (scene.flat or not job.options.tuning):
-            return cls(scene, job, None, (), viewer)
-        look = job.look(job.options.tuning or MAX_VIEWS)
-        if scene.flat:  # what views show of discs is found by 3D Gaussians without thickness, whose gradients are fast
-            look = own_look(replace(scene, flat=False), look.training, look.rasterizer, look.background)
-        return cls(scene, job, look, job.views, viewer)
-
-    def __call__(self, before: Level, goal: Goal) -> Level:
-        """The level for a goal."""
-        scene, monitor = before.scene, self.job.monitor
-        unchanged = before._replace(rate=goal.rate, parents=torch.arange(len(scene)))
-        if not len(scene):
-            return unchanged
-        try:
-            rates = rates_of(scene, self.job.cameras.train)
-        except FrameError:
-            if scene is self.scene:
-                raise
-            return unchanged  # no camera sees any of what is left
-        visible = None
-        if self.look is not None and not self.job.cameras.assumed:
-            look = self.look if scene is self.scene else self.look.showing(replace(scene, flat=False))
-            scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
-            with monitor.progress("looking", "views") as tell:
-                visible = visibility(look, self.views, scale, tell)
-        with monitor.progress("merging", "Gaussians") as tell:
-            level = merge(scene, rates, goal, tell, visible, before.chunks)
-        monitor.say(f"{counted(len(level.scene), 'Gaussian')} for {goal.rate:.3g} × the training rate")
-        return self._tuned(level) if self.viewer is None else level
-
-    def finished(self, level: Level) -> Level:
-        """The level as its file holds it: tuned or, without tuning, converted for the viewer, if there is one.
-
-        Levels of a tree are tuned later, all together.
-        """
-        if self.viewer is None or not len(level.scene):
-            return level
-        if self.job.options.tuning and self.job.options.to != "rad":
-            return self._tuned(level)
-        training = TrainingViews.of(level.scene, self.job.cameras, min_seen=0.0)
-        return level._replace(scene=fuse_for(level.scene, training, self.viewer))
-
-    def above(self, front: Front | None, level: Level) -> Front:
-        """The front with a level above it: of its Gaussians, those that Spark draws at the level's rate.
-
-        A larger one would be replaced by its children, so they stay on the front.
-        """
-        if front is None or level.parents is None:
-            return Front.of(self.finished(level).scene)
-        if not len(level.scene):
-            return front
-        owners, places = level.parents[front.owners], (front.parents < 0).nonzero()[:, 0]
-        try:
-            px = level.rate * rates_of(level.scene, self.job.cameras.train)
-        except FrameError:  # no camera sees any of what is left
-            return front._replace(owners=owners)
-        small = node_sizes(level.scene) * px <= MAX_NODE_SIZE
-        taken, goes = small.nonzero()[:, 0], small[owners]
-        if not len(taken):
-            return front._replace(owners=owners)
-        new = self.finished(level._replace(scene=level.scene[taken])).scene
-        parents = len(front.scene) + (small.cumsum(0) - 1)[owners[goes]]
-        return Front(
-            joined([front.scene, new]),
-            torch.cat([front.parents.index_copy(0, places[goes], parents), torch.full((len(new),), -1)]),
-            torch.cat([owners[~goes], taken]),
-        )
-
-    def _tuned(self, level: Level) -> Level:
-        options, look = self.job.options, self.look
-        if not options.tuning or look is None or self.scene.flat:
-            return level
-        if self.viewer is not None and level.scene is self.scene:
-            usual = steps_for(self.scene, self.viewer)
-            steps = options.steps if usual and options.steps is not None else usual
-            return level._replace(scene=fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)[0])
-        smaller = SMALLER_IMAGES if options.single and self.viewer is None else ()
-        how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller)
-        scene = refine(level.scene, level.rate, look, *how)
-        return level._replace(scene=scene)
-
-
-def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
-    """The goals of merging, one scene after the other.
-
-    Raises UsageError if the scene has fewer Gaussians than asked for.
-    """
-    if not options.single:
-        levels = range(1, (options.levels or DEFAULT_LEVELS) + 1)
-        return [Goal(0.5**level, tolerance=TOLERANCE, smallest=options.merge_below) for level in levels]
-    if options.budget is not None:
-        columns = len(columns_of(scene[:0])) + NORMAL_COLUMNS
-        header = RECORDS_BYTES + COLUMN_BYTES * columns
-        count = min(len(scene), int((options.budget * MEGABYTE - header) / (FLOAT * columns)))
-        if count < 1 <= len(scene):
-            raise UsageError("budget", f"holds no Gaussian beside the header of a .ply, of up to {header:,} bytes")
-    else:
-        assert options.simplify is not None
-        count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))
-    if count > len(scene):
-        raise UsageError("simplify", f"asks for {counted(count, 'Gaussian')}, and the scene has {len(scene):,}")
-    count = max(1, count)
-    rate = min(1.0, math.sqrt(count / max(1, len(scene))))  # a quarter is meant for half the size, as on a surface
-    return [Goal(options.scale or rate, count)]
-
-
-def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterator[Level]:
+def _levels(maker: LevelMaker, folder: Path | None, files: Sequence[Path]) -> Iterator[Level]:
     """The scene and its levels, each written before the next is made; levels for a viewer are no pyramid.
 
     Streamed levels are cut before the pyramid, which they are made of, lists them; it is removed at the end.
@@ -238,7 +94,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     options = maker.job.options
     there: Iterator[Level] = iter(())
     pyramid = folder if options.viewer is None or options.to else None
-    goals = goals_of(options, maker.scene)
+    goals = maker.goals
     cameras = maker.job.cameras
     facts = [digest_of_scene(maker.scene), digest_of_cameras(cameras.train), cameras.background] if pyramid else []
     choices = [options.merge_below, options.tuning, options.views, options.background, options.cull_margin]
@@ -257,7 +113,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     for place in range(len(goals) + 1):
         if place:
             made = next(there, None) or maker(made, goals[place - 1])
-        resumed, level, kept = place < len(manifest.levels), made, made
+        resumed, level = place < len(manifest.levels), made
         if options.to == "rad":
             start = len(front.scene) if front else 0
             front = streamed.read_front(folder, place) if resumed and folder else maker.above(front, made)
@@ -266,12 +122,11 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
                 streamed.write_front(folder, place, front, start)
         elif options.to is None or not resumed:
             level = maker.finished(made)
-            if options.to is None:
-                kept = level
-            elif folder is not None:
+            if options.to is not None and folder is not None:
                 parts = streamed.parts_of(level, leaves, streamed.middle_of(maker.scene, options.to))
                 streamed.write_level(folder, options.to, place, parts)
         if folder is not None and not resumed:
+            kept = made if options.to else level
             write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
                 assert made.chunks is not None
@@ -283,7 +138,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
         yield level
 
 
-def _streamed(maker: _Maker, folder: Path, to: StreamName, files: Sequence[Path]) -> list[Level]:
+def _streamed(maker: LevelMaker, folder: Path, to: StreamName, files: Sequence[Path]) -> list[Level]:
     """The levels, streamed; what a run that is cut short resumes from is removed."""
     options, cameras, earlier = maker.job.options, maker.job.cameras, streamed.part_folders(folder, to)
     (folder / STREAMS[to].index).unlink(missing_ok=True)

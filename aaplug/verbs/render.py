@@ -8,14 +8,14 @@ from typing import NamedTuple
 from aaplug.core.cameras import Camera
 from aaplug.core.exposures import frame_count
 from aaplug.io.cameras import read_camera_path, select_views
+from aaplug.io.image_files import image_paths, names_image
 from aaplug.options.verbs import RenderOptions
-from aaplug.rendering.film import drawn
+from aaplug.rendering.film import drawn, storage_of
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import counted, one
 from aaplug.verbs.verb import AnyPath, SceneLike, writes
-from aaplug.verbs.views import image_paths, names_image, storage_of
 
 
 class Written(NamedTuple):

@@ -24,8 +24,6 @@ from aaplug.system.executors import given_threads, torch_threads
 P = ParamSpec("P")
 O_contra = TypeVar("O_contra", bound=Options, contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
-IS_COMPLETE = "is of a run that is complete: nothing is left to resume; `overwrite` starts anew"
-RESUME_OR_OVERWRITE = "continues a run, and `overwrite` starts anew; give one"
 ScenesLike = Mapping[str, SceneLike] | Sequence[SceneLike]
 
 

@@ -17,11 +17,12 @@ from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.evaluation.report.contact_sheet import side_by_side
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.image_files import FrameSequence
 from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_image
 from aaplug.io.video import CODECS, check_video, write_video
 from aaplug.options.verbs import BUILT_IN_PATHS, RECEDING_PATHS, VideoOptions
-from aaplug.rendering.film import drawn
+from aaplug.rendering.film import drawn, storage_of
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running, sizes_of
 from aaplug.rendering.renderer import Renderer
@@ -29,7 +30,6 @@ from aaplug.system.errors import UsageError, counted, listing
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 from aaplug.verbs.verb import AnyPath, SceneLike, writes
-from aaplug.verbs.views import FrameSequence, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 MAX_FRAMES = 100_000

@@ -1,48 +1,27 @@
-"""The files that rendered views go to, checked before any work."""
+"""Files of drawn views, one for each: how they are named, and which exist; checked before any work."""
 
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from unicodedata import normalize
 
 from aaplug.core.cameras import Camera
-from aaplug.core.colours import BLACK
-from aaplug.evaluation.journal import check_request
 from aaplug.io.atomic import check_output, refuse_existing, write_file
-from aaplug.io.image_formats import IMAGE_FORMATS, Storage
+from aaplug.io.image_formats import IMAGE_FORMATS
 from aaplug.io.video import CODECS
-from aaplug.options.verbs import RenderOptions, VideoOptions
-from aaplug.system.errors import START_AGAIN, FormatError, OutputError, UsageError, counted, listing
-from aaplug.verbs.verb import RESUME_OR_OVERWRITE
+from aaplug.system.digests import check_request
+from aaplug.system.errors import START_AGAIN, FormatError, OutputError, counted, listing
 
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif", *CODECS)  # any other name is a folder
-Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 DEVICE = re.compile("con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)  # no file on Windows, whatever its suffix
 PLACES = re.compile("#+")  # of a frame's number in a name
 SEPARATORS = "._-"  # between it and the rest
 USUAL_NAME = "frame.####"  # in a folder
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
-
-
-def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
-    """How images are stored, and the options; those for images with alpha have no background.
-
-    Raises UsageError if the format does not hold what is asked for, or there is to be a background and alpha or no rgb.
-    """
-    passes = [options.passes] if isinstance(options.passes, str) else options.passes
-    stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)
-    storage = Storage.of(output, options.format, passes, *stored)
-    if options.background != "auto" and "rgb" not in storage.passes:
-        raise UsageError("background", "is of the pass rgb, which `passes` leaves out")
-    if "alpha" not in storage.passes:
-        return storage, options
-    if options.background != "auto":
-        raise UsageError("background", "is not stored where alpha is; leave one of them out")
-    return storage, replace(options, background=BLACK)
 
 
 def names_image(output: Path) -> bool:
@@ -118,8 +97,6 @@ class FrameSequence:
 
     def check(self, overwrite: bool, resume: bool) -> None:
         """Refuse, before any work, frames that exist unless `overwrite` or `resume` is set, and further ones."""
-        if resume and overwrite:
-            raise UsageError("resume", RESUME_OR_OVERWRITE)
         files = [*self.paths, self.record]
         before, after = PLACES.split(self.pattern.name)
         numbered = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}", re.ASCII)
