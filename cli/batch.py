@@ -10,28 +10,25 @@ from pathlib import Path
 from typing import Any
 
 import aaplug
-from aaplug.options.base import as_path, flag
+from aaplug.options.base import SWITCH, as_path, flag
 from aaplug.options.verbs import DRAWING, EvaluateOptions, RecipeOptions
 from aaplug.system.errors import FormatError, UsageError, did_you_mean
 
 from .console import TERMINAL, quiet
 from .inputs import path_of, read_inputs, told
-from .words import Answer, Option, Words
+from .words import Answer, Words
 
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite", "models", "skip")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
 
-BATCH = Option(
-    "batch",
-    flag("FILE.toml", read=as_path),
-    "File of scenes and their settings, for an --output folder; options given here hold where it says nothing.",
+BATCH = flag("FILE.toml", read=as_path).named(
+    "batch", "File of scenes and their settings, for an --output folder; options given here hold where it says nothing."
 )
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
     BATCH,
-    Option("resume", None, "With --batch: leave out scenes whose output is there.", False),
-    Option(
+    SWITCH.named("resume", "With --batch: leave out scenes whose output is there."),
+    flag("local|tcp://HOST:PORT").named(
         "scheduler",
-        flag("local|tcp://HOST:PORT"),
         "With --batch: a scene at a time on each worker of a Dask cluster; see `aaplug guide cluster`.",
         group=DRAWING,
     ),
@@ -153,7 +150,7 @@ def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refu
         for name, value in settings.items():
             if name not in names:
                 raise FormatError(path, f"{where}: {name} is no setting here{did_you_mean(name, names)}")
-            is_switch = options[name].argument is None and isinstance(value, bool)
+            is_switch = options[name].count == 0 and isinstance(value, bool)
             texts = [*map(str, value if isinstance(value, list) else [value])]
             values[name] = value if is_switch else options[name].value(texts)
         return words.where(**values).checked()

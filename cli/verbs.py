@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import aaplug
 from aaplug.options import verbs
-from aaplug.options.base import Options, as_path, flag, names, number
+from aaplug.options.base import SWITCH, Option, Options, as_path, flag, names, number
 from aaplug.options.verbs import MAX_SIDE, RECIPE_METAVAR, RECIPE_NAMES, REPORT, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, counted, printable
 
@@ -26,7 +26,7 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import VERBS, Answer, Command, Option, Words, json_of, output, scene_paths
+from .words import VERBS, Answer, Command, Words, json_of, output, scene_paths
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
@@ -164,12 +164,11 @@ def finetune(words: Words) -> Answer:
         "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
     ),
     BATCH,
-    Option(
+    flag("FOLDER", read=as_path).named(
         "models",
-        flag("FOLDER", read=as_path),
         "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
     ),
-    Option("skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False),
+    SWITCH.named("skip", "With such a folder: leave out scenes that are missing or fail; the table says which."),
     CameraOptions,
     Orbit,
     output("FOLDER", "Folder for results.json, per_view.json and results.csv.", None),
@@ -222,13 +221,12 @@ def video(words: Words) -> Answer:
         "SCENE SCENE [SCENE ...]",
         "Two or more scenes of any format, or their folders; the others are compared with the first.",
     ),
-    Option("reference", flag("SCENE", read=as_path), "The scene to compare the others with, instead of the first."),
+    flag("SCENE", read=as_path).named("reference", "The scene to compare the others with, instead of the first."),
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
-    Option(
+    number(0, 200, unit="dB").named(
         "fail_under",
-        number(0, 200, unit="dB"),
         "Exit with 1 if the mean PSNR of a scene but the first is below so many dB at any scale: --fail-under 40dB.",
         group=REPORT,
     ),
@@ -284,7 +282,7 @@ def merge(words: Words) -> Answer:
 @verb(
     *SCENE_AND_CAMERAS,
     FrameOptions,
-    Option("limits", None, "Show every limit on files instead, and the environment variable that changes it.", False),
+    SWITCH.named("limits", "Show every limit on files instead, and the environment variable that changes it."),
     json_of("one JSON object instead of a table"),
 )
 def info(words: Words) -> Answer:
@@ -337,7 +335,7 @@ def _limits() -> Answer:
 
 @verb(
     output("FOLDER", "Folder for the converted scene, the contact sheet and the results.", Path("demo-out")),
-    Option("overwrite", None, "Replace the files of an earlier demo.", False),
+    SWITCH.named("overwrite", "Replace the files of an earlier demo."),
 )
 def demo(words: Words) -> Answer:
     """Convert, render and measure the bundled scene: a pretrained chair and four photographs.
@@ -368,15 +366,11 @@ def view(words: Words) -> Answer:
 
 
 @verb(
-    Option(
-        "recipe",
-        names(kind="recipe", metavar=RECIPE_METAVAR, count=None),
-        "Recipes whose kernels to compile, beside those of auto, matched, classic and mip.",
-        (),
+    names(kind="recipe", metavar=RECIPE_METAVAR, count=None).named(
+        "recipe", "Recipes whose kernels to compile, beside those of auto, matched, classic and mip.", default=()
     ),
-    Option(
+    flag("FOLDER", read=as_path).named(
         "bundle",
-        flag("FOLDER", read=as_path),
         "Compile into a folder, for other machines with the same torch: for x86-64-v3 and x86-64-v4."
         " Where AAPLUG_KERNELS names the folder, no compiler is needed.",
     ),
@@ -393,7 +387,7 @@ def warmup(words: Words) -> Answer:
 
 
 @verb(
-    Option("module", flag("MODULE", by_place=True), "The package, or one of its modules.", MISSING),
+    flag("MODULE", by_place=True).named("module", "The package, or one of its modules.", default=MISSING),
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> Answer:
@@ -408,13 +402,12 @@ def check_plugin(words: Words) -> Answer:
 
 
 @verb(
-    Option(
+    flag("[PROGRAM]", by_place=True).named(
         "program",
-        flag("[PROGRAM]", by_place=True),
         "A command line in quotes, in which {scene}, {camera} and {image} stand for the .ply, the camera's .json and"
         " the .png to write; without them, the three are added at the end.",
     ),
-    Option("images", flag("FOLDER", read=as_path), "Instead: pictures made by hand, such as dilation.png."),
+    flag("FOLDER", read=as_path).named("images", "Instead: pictures made by hand, such as dilation.png."),
     output("FOLDER", "Folder for scenes, cameras and pictures; alone, it gets the expected pictures.", None),
     verbs.ConformOptions,
     json_of("the verdicts as one JSON object"),
@@ -506,7 +499,7 @@ def recipes(words: Words) -> Answer:
     return Answer(facts, [table(rows[0], headings), "For comparison:", table(rows[1], headings)])
 
 
-@verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print."))
+@verb(names(*GUIDES, metavar="[NAME]", by_place=True).named("name", "The guide to print."))
 def guide(words: Words) -> Answer:
     """List the guides, or print one.
 

@@ -7,14 +7,14 @@ the heading under which it stands.
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
 from io import StringIO
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
-from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, as_path, docs_of, flag
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, AaplugError, UsageError, did_you_mean, within_memory
+from aaplug.options.base import PYTHON_ONLY, SWITCH, Group, Option, Options, as_path, docs_of, flag, option_of
+from aaplug.system.errors import AaplugError, UsageError, did_you_mean, within_memory
 
 # a word that names a file, unlike names and numbers such as 1/4
 FILE = re.compile(r"(?!\.?\d[\d./,]*$)(.*/.*|.*\.[A-Za-z]\w*)", re.DOTALL)
@@ -25,81 +25,43 @@ SILENT_DEFAULTS = (None, False, True, (), math.inf)  # that help does not show
 T = TypeVar("T", bound=Options)
 
 
-class Option(NamedTuple):
-    """One option of a verb.  argument: how its value is read; None for a switch.  default: MISSING if it is needed."""
+def _spec(option: Option) -> tuple[str, Any, Any]:
+    """An option as a field of the parser's dataclass."""
+    import tyro
 
-    name: str
-    argument: Argument | None
-    help: str
-    default: Any = None
-    group: Group | None = None
+    text, default = option.help, field(default=option.default)
+    hint = "" if option.default in SILENT_DEFAULTS or "(default" in text else None
+    if option.count == 0:
+        about = tyro.conf.arg(help=text, help_behavior_hint=hint)
+        return option.name, Annotated[bool, about], default
+    metavar = option.metavar
+    if len(metavar) > MAX_METAVAR:
+        listed = metavar.replace(" ...", "").replace("|...", " and others").replace("|", ", ")
+        metavar, text = option.name.upper().replace("_", "-"), f"{text}  Names: {listed}."
 
-    @property
-    def flags(self) -> list[str]:
-        """The words that name it, the one for messages first; none for an option without a name."""
-        if self.argument is not None and self.argument.by_place:
-            return []
-        name = ("--no-" if self.default is True else "--") + self.name.replace("_", "-")
-        others = self.argument.flags if self.argument else ()
-        return sorted([name, *others], key=lambda one: (one[1] != "-", one == name))
+    def words_of(value: Any) -> list[str]:
+        values = value if isinstance(value, list | tuple) else [value]
+        return [f"{each:g}" if isinstance(each, float) else str(each) for each in values]
 
-    @property
-    def shown(self) -> str:
-        """The option as messages name it."""
-        return self.flags[0] if self.flags else str(self.argument and self.argument.metavar.split()[0].strip("[]"))
-
-    def value(self, words: Sequence[str]) -> Any:
-        """The value that words give; raises UsageError."""
-        if self.argument is None and not words:
-            return not self.default
-        takes, got = "no value", " ".join(words)[:MAX_VALUE_CHARACTERS].strip() or "nothing"
-        if self.argument is not None:
-            with suppress(ValueError):
-                value = self.argument.value(words)
-                self.argument.check(self.shown, value)
-                return value
-            takes = self.argument.takes or self.argument.metavar
-        raise UsageError(self.shown, f"takes {takes}, got {got}")
-
-    @property
-    def spec(self) -> tuple[str, Any, Any]:
-        """The option as a field of the parser's dataclass."""
-        import tyro
-
-        argument, text, default = self.argument, self.help, field(default=self.default)
-        hint = "" if self.default in SILENT_DEFAULTS or "(default" in text else None
-        if argument is None:
-            about = tyro.conf.arg(help=text, help_behavior_hint=hint)
-            return self.name, Annotated[bool, about], default
-        metavar = argument.metavar
-        if len(metavar) > MAX_METAVAR:
-            listed = metavar.replace(" ...", "").replace("|...", " and others").replace("|", ", ")
-            metavar, text = self.name.upper().replace("_", "-"), f"{text}  Names: {listed}."
-
-        def words_of(value: Any) -> list[str]:
-            values = value if isinstance(value, list | tuple) else [value]
-            return [f"{each:g}" if isinstance(each, float) else str(each) for each in values]
-
-        how = argument.count or "*", metavar, self.value, lambda _: True, words_of
-        about = tyro.conf.arg(metavar=metavar, aliases=argument.flags, help=text, help_behavior_hint=hint)
-        place = (tyro.conf.Positional,) * argument.by_place
-        annotation = Annotated[(Any, tyro.constructors.PrimitiveConstructorSpec(*how), about, *place)]
-        return self.name, annotation, default
+    how = option.count or "*", metavar, option.value, lambda _: True, words_of
+    about = tyro.conf.arg(metavar=metavar, aliases=option.also, help=text, help_behavior_hint=hint)
+    place = (tyro.conf.Positional,) * option.by_place
+    return option.name, Annotated[(Any, tyro.constructors.PrimitiveConstructorSpec(*how), about, *place)], default
 
 
 def output(metavar: str, text: str, default: Any = MISSING) -> Option:
     """The option that names what to write."""
-    return Option("output", flag(metavar, "-o", read=as_path), text, default)
+    return flag(metavar, "-o", read=as_path).named("output", text, default=default)
 
 
 def scene_paths(name: str, metavar: str, text: str) -> Option:
     """The option without a name that takes one or more scenes."""
-    return Option(name, flag(metavar, read=as_path, by_place=True, count=None), text, ())
+    return flag(metavar, read=as_path, by_place=True, count=None).named(name, text, default=())
 
 
 def json_of(what: str) -> Option:
     """The option that prints a result as JSON."""
-    return Option("json", None, f"Print {what} on stdout.", False)
+    return SWITCH.named("json", f"Print {what} on stdout.")
 
 
 def options_of(options: type[Options]) -> list[Option]:
@@ -107,10 +69,11 @@ def options_of(options: type[Options]) -> list[Option]:
     hints, docs = get_type_hints(options, include_extras=True), docs_of(options)
     stated = []
     for each in fields(options):
-        parts = getattr(hints[each.name], "__metadata__", ())
+        hint = hints[each.name]
+        parts = getattr(hint, "__metadata__", ())
         if PYTHON_ONLY not in parts:
             group = next((part for part in parts if isinstance(part, Group)), None)
-            stated.append(Option(each.name, argument_of(hints[each.name]), docs[each.name], each.default, group))
+            stated.append(option_of(hint).named(each.name, docs[each.name], default=each.default, group=group))
     return stated
 
 
@@ -199,7 +162,7 @@ class Command:
 
         specs, groups = list[Any](), dict[Group, list[Any]]()
         for each in sorted(self.options.values(), key=lambda each: each.default is not MISSING):
-            (groups.setdefault(each.group, []) if each.group else specs).append(each.spec)
+            (groups.setdefault(each.group, []) if each.group else specs).append(_spec(each))
         for group, members in groups.items():
             nested = make_dataclass(group.title, members)
             nested.__doc__ = group.about
@@ -226,7 +189,7 @@ class Command:
                 option = flags.get(name)
                 others.append(word)
             else:
-                several = option and option.argument and option.argument.count is None
+                several = option and option.count is None
                 (files if several and FILE.fullmatch(word) else others).append(word)
         box, conf = StringIO(), tyro.conf
         config = conf.OmitArgPrefixes, conf.FlagCreatePairsOff, conf.HelptextFromCommentsOff

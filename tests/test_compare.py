@@ -19,7 +19,7 @@ from aaplug.evaluation.alignment import mismatch
 from aaplug.evaluation.comparison import differences
 from aaplug.evaluation.engine import ViewMeasurer
 from aaplug.evaluation.journal import Journal
-from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_sheet, error_map, labelled, magnified
+from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_sheet, error_map, side_by_side
 from aaplug.io.images import image_size
 from aaplug.system.executors import load, save
 from tests.conftest import EYES, make_scene
@@ -248,10 +248,10 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
 
 def test_pictures_hold_no_sign_that_the_font_lacks(texts):
     image = torch.zeros(400, 400, 3)
-    labelled(image, "4× – é ∞ 日")
-    magnified(image, 0.1, "½ of {times}×")
+    side_by_side([image, image], ["4× – é ∞ 日", "½×"], 0.1)
     contact_sheet(("a×", "b×"), [(2.0, (image, image))])
-    assert texts == ["4x - e inf ?", "1?2 of 9x", "ax", "bx", "2x: 400x400", "equal"]
+    enlarged = "0.10 of training's sampling, 9x"
+    assert texts == [enlarged, "4x - e inf ?", enlarged, "1?2x", "ax", "bx", "2x: 400x400", "equal"]
 
 
 def test_under_each_picture_stands_its_psnr_against_the_first_of_its_row(texts):

@@ -69,8 +69,8 @@ def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another_and_shows_eve
     shown = "".join(text.split())
     assert not re.search(r"default:(True|False|None|inf)\)", shown), "of a switch"
     for option in VERBS[verb].options.values():
-        if option.argument is not None and ".." in option.argument.takes:
-            assert f"{option.flags[0]}{option.argument.metavar}".replace(" ", "") in shown
+        if ".." in option.takes:
+            assert f"{option.flags[0]}{option.metavar}".replace(" ", "") in shown
 
 
 def test_render_shows_few_options_before_those_with_a_heading(cli):

@@ -11,14 +11,14 @@ import pytest
 from aaplug_cli.verbs import VERBS
 
 from aaplug.io.batch_file import read_batch
-from aaplug.options.base import Argument, Options, names
+from aaplug.options.base import Option, Options, names
 from aaplug.system.errors import UsageError
 from tests.conftest import run_python
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
 
-def fits(spec: Argument, value: Any) -> bool:
+def fits(spec: Option, value: Any) -> bool:
     """True if a value is not refused."""
     try:
         spec.check("option", value)
@@ -36,7 +36,7 @@ def numbers(options: type[Options]) -> dict[str, list[Any]]:
     hints, plain = get_type_hints(options, include_extras=True), get_type_hints(options)
     named = [n for n, hint in plain.items() if numeric(hint) and n != "background"]  # a colour or a name
     stated = {name: getattr(hints[name], "__metadata__", ()) for name in named}
-    return {n: [p for p in parts if isinstance(p, Argument) and ".." in p.takes] for n, parts in stated.items()}
+    return {n: [p for p in parts if isinstance(p, Option) and ".." in p.takes] for n, parts in stated.items()}
 
 
 ALL = sorted({group for verb in VERBS.values() for group in verb.classes}, key=lambda c: c.__name__)
@@ -136,9 +136,9 @@ def test_no_option_takes_an_empty_word():
     """As a variable of a shell leaves it that is not set; a path would be the folder that the program runs in."""
     for command in VERBS.values():
         for option in command.options.values():
-            if option.argument is not None:
+            if option.count != 0:
                 with pytest.raises(UsageError, match=r"takes .*, got nothing"):
-                    option.value([""] * (option.argument.count or 1))
+                    option.value([""] * (option.count or 1))
 
 
 def test_a_refusal_has_no_frame_on_a_terminal_without_unicode(monkeypatch):

@@ -6,7 +6,8 @@ import os
 import re
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
@@ -31,34 +32,64 @@ class Group:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Argument:
-    """How an option is read from words, checked and shown by `--help`.
+class Option:
+    """An option of a verb: how it is read from words, checked and shown by `--help`.
 
+    default: MISSING if it is needed.
     metavar: stands for the value.  takes: the values that fit, for messages; the metavar if empty.
-    read: makes a value of one word, or raises ValueError.  count: number of words; None for one or more.
-    flags: other names than the field's, such as -m.  by_place: True if it is given without a name.
+    read: makes a value of one word, or raises ValueError.
+    count: number of words; 0 for a switch, None for one or more.
+    also: other names than the field's, such as -m.  by_place: True if it is given without a name.
     check: called with the option's name and a value; raises UsageError for one that does not fit.
     """
 
-    metavar: str
+    name: str = ""
+    help: str = ""
+    default: Any = None
+    group: Group | None = None
+    metavar: str = ""
     takes: str = ""
     read: Callable[[str], Any] = str
     count: int | None = 1
-    flags: tuple[str, ...] = ()
+    also: tuple[str, ...] = ()
     by_place: bool = False
     check: Callable[[str, Any], object] = lambda option, value: None
 
+    def named(self, name: str, help: str, **how: Any) -> "Option":
+        """The option of this name; how: `default` and `group`."""
+        return replace(self, name=name, help=help, **how)
+
+    @property
+    def flags(self) -> list[str]:
+        """The words that name it, the one for messages first; none for an option without a name."""
+        name = ("--no-" if self.default is True else "--") + self.name.replace("_", "-")
+        return [] if self.by_place else sorted([name, *self.also], key=lambda one: (one[1] != "-", one == name))
+
+    @property
+    def shown(self) -> str:
+        """The option as messages name it."""
+        return self.flags[0] if self.flags else self.metavar.split()[0].strip("[]")
+
     def value(self, words: Sequence[str]) -> Any:
-        """The value that words give, several of them also between commas; raises ValueError."""
+        """The value that words give, several of them also between commas; raises UsageError."""
+        if self.count == 0 and not words:
+            return not self.default
+        got = " ".join(words)[:MAX_VALUE_CHARACTERS].strip() or "nothing"
         if self.count is None:
             words = [part for word in words for part in map(str.strip, word.split(",")) if part]
-        if not words or not all(words) or len(words) != (self.count or len(words)):
-            raise ValueError(words)
-        values = tuple(map(self.read, words))
-        return values[0] if self.count == 1 else values
+        with suppress(ValueError):
+            if words and all(words) and len(words) == (len(words) if self.count is None else self.count):
+                values = tuple(map(self.read, words))
+                value = values[0] if self.count == 1 else values
+                self.check(self.shown, value)
+                return value
+        raise UsageError(self.shown, f"takes {self.takes or self.metavar}, got {got}")
 
 
-def flag(metavar: str, *flags: str, parsed: Callable[[str, str], object] | None = None, **how: Any) -> Argument:
+SWITCH = Option(takes="no value", count=0, default=False)
+
+
+def flag(metavar: str, *flags: str, parsed: Callable[[str, str], object] | None = None, **how: Any) -> Option:
     """An option that takes text: any, or what `parsed`, which is given it and the option, does not refuse."""
 
     def check(option: str, value: Any) -> None:
@@ -66,7 +97,7 @@ def flag(metavar: str, *flags: str, parsed: Callable[[str, str], object] | None 
             if parsed is not None and isinstance(each, str):
                 parsed(each, option)
 
-    return Argument(metavar=metavar, flags=flags, check=check, **how)
+    return Option(metavar=metavar, also=flags, check=check, **how)
 
 
 def as_path(word: str) -> Path:
@@ -81,7 +112,7 @@ def as_path(word: str) -> Path:
     return Path(os.path.expanduser(word))
 
 
-def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Argument:
+def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Option:
     """An option that takes a name: one of these, or of those in the registry of a kind, of which it takes objects too.
 
     A name that is given twice does not fit.
@@ -101,7 +132,7 @@ def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) 
                 raise UsageError(option, not_one_of(name, known()))
 
     how = {"read": lambda word: values.get(word, word), "metavar": metavar or "|".join(known())} | how
-    return Argument(check=check, **how)
+    return Option(check=check, **how)
 
 
 def number(
@@ -113,7 +144,7 @@ def number(
     unit: str = "",
     metavar: str = "",
     length: int | None = None,
-) -> Argument:
+) -> Option:
     """An option that takes a number from `least` to `most`, or one or more.
 
     A number that need not be whole may be written as 1/4 or 25%.  unit: may follow it as the word's end.
@@ -144,7 +175,7 @@ def number(
         raise UsageError(option, f"takes {wanted}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
 
     how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "check": check}
-    return Argument(metavar=metavar or span + " ..." * several, **how)
+    return Option(metavar=metavar or span + " ..." * several, **how)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -166,8 +197,8 @@ class Options:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
-        for name, argument in _checks(type(self)).items():
-            argument.check(name, getattr(self, name))
+        for name, option in _stated(type(self)).items():
+            option.check(name, getattr(self, name))
         check_fields(self)
         for base in reversed(type(self).__mro__):
             if "_rules" in vars(base):
@@ -180,11 +211,11 @@ class Options:
                 raise UsageError(name, problem)
 
 
-def argument_of(annotation: Any) -> Argument | None:
-    """The argument that a field's annotation states, or that of a Literal; None for a switch."""
-    stated = [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, Argument)]
+def option_of(annotation: Any) -> Option:
+    """The option that a field's annotation states, that of a Literal, or a switch."""
+    stated = [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, Option)]
     kind = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-    return stated[0] if stated else names(*get_args(kind)) if get_origin(kind) is Literal else None
+    return stated[0] if stated else names(*get_args(kind)) if get_origin(kind) is Literal else SWITCH
 
 
 @cache
@@ -200,6 +231,5 @@ def docs_of(options: type) -> dict[str, str]:
 
 
 @cache
-def _checks(options: type[Options]) -> dict[str, Argument]:
-    hints = get_type_hints(options, include_extras=True)
-    return {name: argument for name, hint in hints.items() if (argument := argument_of(hint)) is not None}
+def _stated(options: type[Options]) -> dict[str, Option]:
+    return {name: option_of(hint) for name, hint in get_type_hints(options, include_extras=True).items()}

@@ -74,7 +74,7 @@ SHOWN_VIEWS = flag("N|NAME,...")
 _PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z", length=3)
 
 OneRecipe = Annotated[str | Recipe, names(kind="recipe", metavar=RECIPE_METAVAR)]
-OneViewer = Annotated[str | Viewer | None, names(kind="viewer", metavar="VIEWER", flags=("--for",))]
+OneViewer = Annotated[str | Viewer | None, names(kind="viewer", metavar="VIEWER", also=("--for",))]
 OneProtocol = Annotated[str | Protocol, names(kind="protocol")]
 
 
@@ -444,7 +444,7 @@ class LodOptions(WritingOptions, ViewOptions):
 class FinetuneOptions(WritingOptions, ViewOptions):
     """The optimization."""
 
-    viewer: Annotated[str | Viewer | None, names("fast", kind="viewer", metavar="fast|VIEWER", flags=("--for",))] = None
+    viewer: Annotated[str | Viewer | None, names("fast", kind="viewer", metavar="fast|VIEWER", also=("--for",))] = None
     """Viewer that will show the scene: fast (aaplug's matched, the default) or one of `aaplug guide viewers`."""
     views: Annotated[str, VIEWS] = "test"
     """Views to measure the result on, by name or split; it is tuned on training views."""

@@ -97,46 +97,31 @@ def side_by_side(
 ) -> Float[Tensor, "h w 3"]:
     """Images from left to right, each with its label; a single image stays as it is.
 
-    rate: size of things against the data set's view; where it falls, the middle is also shown enlarged.
+    rate: size of things against the data set's view.  Where it falls, the middle is also shown enlarged in the bottom
+        right corner, each pixel as a sharp square.  The inset stays outside of these things, and shows half of them
+        along each side, or a little more; without room for `MIN_INSET` px there is none.
     size: of the images, relative to the training size.
     """
     if len(images) == 1:
         return images[0]
-    caption = f"{rate * size:.2f} of training's sampling, {{times}}x"
-    insets = [magnified(image, min(1.0, rate), caption) for image in images]
-    panes = [labelled(image, label) for image, label in zip(insets, labels, strict=True)]
-    gap = torch.zeros(panes[0].shape[0], PANE_GAP, 3)
-    return torch.cat([part for pane in panes for part in (gap, pane)][1:], dim=1)
-
-
-def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
-    """A copy of the image with a label on a dark strip in its top left corner."""
-    pixels = _bytes(image)
-    _write_on_strip(pixels, label, 0, 0)
-    return torch.from_numpy(pixels).float() / BYTE
-
-
-def magnified(image: Float[Tensor, "h w 3"], part: float, label: str) -> Float[Tensor, "h w 3"]:
-    """A copy of the image with its middle enlarged in the bottom right corner, each pixel to a sharp square.
-
-    part: share of the image that is of interest, in the middle, along each side.  The inset stays outside of it and
-        shows half of it along each side, or a little more; without room for `MIN_INSET` px there is none.
-    label: stands above the inset; {times} in it becomes the enlargement.
-    """
-    pixels = _bytes(image)
-    height, width, _ = pixels.shape
-    room = int((1 - part) / 2 * min(height, width)) - FRAME
-    times = int((1 - part) / part)
-    if times > 1 and room >= MIN_INSET:
-        side = room // times
-        top, left = (height - side) // 2, (width - side) // 2
-        inset = pixels[top : top + side, left : left + side].repeat(times, axis=0).repeat(times, axis=1)
-        y, x = height - len(inset), width - len(inset)
-        pixels[y - FRAME :, x - FRAME :] = FRAME_INK
-        pixels[y:, x:] = inset
-        words = label.format(times=times)
-        _write_on_strip(pixels, words, max(0, width - _text_width(words) - 2 * GAP), y - FRAME - HEADING)
-    return torch.from_numpy(pixels).float() / BYTE
+    part, panes = min(1.0, rate), list[np.ndarray]()
+    for image, label in zip(images, labels, strict=True):
+        pixels = _bytes(image)
+        height, width, _ = pixels.shape
+        room = int((1 - part) / 2 * min(height, width)) - FRAME
+        times = int((1 - part) / part)
+        if times > 1 and room >= MIN_INSET:
+            side = room // times
+            top, left = (height - side) // 2, (width - side) // 2
+            inset = pixels[top : top + side, left : left + side].repeat(times, axis=0).repeat(times, axis=1)
+            y, x = height - len(inset), width - len(inset)
+            pixels[y - FRAME :, x - FRAME :] = FRAME_INK
+            pixels[y:, x:] = inset
+            words = f"{rate * size:.2f} of training's sampling, {times}x"
+            _write_on_strip(pixels, words, max(0, width - _text_width(words) - 2 * GAP), y - FRAME - HEADING)
+        _write_on_strip(pixels, label, 0, 0)
+        panes += [np.zeros((height, PANE_GAP, 3), dtype=np.uint8), pixels]
+    return torch.from_numpy(np.concatenate(panes[1:], axis=1)).float() / BYTE
 
 
 def _write_on_strip(pixels: np.ndarray, text: str, left: int, top: int) -> None:
