@@ -11,9 +11,9 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
 from io import StringIO
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar
 
-from aaplug.options.base import PYTHON_ONLY, SWITCH, Group, Option, Options, as_path, docs_of, flag, option_of
+from aaplug.options.base import PYTHON_ONLY, SWITCH, Group, Option, Options, as_path, flag, options_of
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, within_memory
 
 # a word that names a file, unlike names and numbers such as 1/4
@@ -62,19 +62,6 @@ def scene_paths(name: str, metavar: str, text: str) -> Option:
 def json_of(what: str) -> Option:
     """The option that prints a result as JSON."""
     return SWITCH.named("json", f"Print {what} on stdout.")
-
-
-def options_of(options: type[Options]) -> list[Option]:
-    """The options that a dataclass states; what the command line does not offer is left out."""
-    hints, docs = get_type_hints(options, include_extras=True), docs_of(options)
-    stated = []
-    for each in fields(options):
-        hint = hints[each.name]
-        parts = getattr(hint, "__metadata__", ())
-        if PYTHON_ONLY not in parts:
-            group = next((part for part in parts if isinstance(part, Group)), None)
-            stated.append(option_of(hint).named(each.name, docs[each.name], default=each.default, group=group))
-    return stated
 
 
 class Words:
@@ -147,7 +134,8 @@ class Command:
         options: dict[str, Option] = {}
         for each in self.stated:
             for option in [each] if isinstance(each, Option) else options_of(each):
-                options.setdefault(option.name, option)
+                if option.group != PYTHON_ONLY:
+                    options.setdefault(option.name, option)
         return options
 
     @property

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.evaluation.report.contact_sheet import side_by_side
 from aaplug.io.video import write_video
 from aaplug.system.errors import OutputError, UsageError
+from aaplug.verbs.video import side_by_side
 from tests.conftest import files_of_at_most
 from tests.test_camera_paths import document
 

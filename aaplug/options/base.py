@@ -7,7 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
@@ -20,7 +20,6 @@ from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
 
 ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # such as https://; a drive of Windows has one letter
-PYTHON_ONLY = "python only"  # marks an option that the command line does not offer
 
 
 @dataclass(frozen=True)
@@ -29,6 +28,9 @@ class Group:
 
     title: str
     about: str
+
+
+PYTHON_ONLY = Group("Python", "Options that the command line does not offer.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,8 +199,8 @@ class Options:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
-        for name, option in _stated(type(self)).items():
-            option.check(name, getattr(self, name))
+        for option in options_of(type(self)):
+            option.check(option.name, getattr(self, option.name))
         check_fields(self)
         for base in reversed(type(self).__mro__):
             if "_rules" in vars(base):
@@ -209,13 +211,6 @@ class Options:
         for name in names:
             if not holds and getattr(self, name) != getattr(type(self), name):
                 raise UsageError(name, problem)
-
-
-def option_of(annotation: Any) -> Option:
-    """The option that a field's annotation states, that of a Literal, or a switch."""
-    stated = [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, Option)]
-    kind = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-    return stated[0] if stated else names(*get_args(kind)) if get_origin(kind) is Literal else SWITCH
 
 
 @cache
@@ -231,5 +226,17 @@ def docs_of(options: type) -> dict[str, str]:
 
 
 @cache
-def _stated(options: type[Options]) -> dict[str, Option]:
-    return {name: option_of(hint) for name, hint in get_type_hints(options, include_extras=True).items()}
+def options_of(options: type[Options]) -> tuple[Option, ...]:
+    """The options of a class: what a field's annotation states, its docstring as help and its default.
+
+    A field of a Literal takes one of its values, and one whose annotation states nothing is a switch.
+    """
+    hints, docs, found = get_type_hints(options, include_extras=True), docs_of(options), list[Option]()
+    for each in fields(options):
+        parts = getattr(hints[each.name], "__metadata__", ())
+        kind = get_args(hints[each.name])[0] if parts else hints[each.name]
+        usual = names(*get_args(kind)) if get_origin(kind) is Literal else SWITCH
+        option = next((part for part in parts if isinstance(part, Option)), usual)
+        group = next((part for part in parts if isinstance(part, Group)), None)
+        found.append(option.named(each.name, docs.get(each.name, ""), default=each.default, group=group))
+    return tuple(found)
