@@ -356,9 +356,7 @@ def view(words: Words) -> Answer:
 
     To write images, use render; for a moving camera, video.
     """
-    scene = cameras = None
-    if words.scene is not None or words.model_path is not None:
-        scene, cameras = read_inputs(words)
+    scene, cameras = read_inputs(words) if words.scene or words.model_path else (None, None)
     command = [word for options in SCENE_AND_CAMERAS for word in words.given(options)]
     command += [] if words.background == "auto" else ["--background", words.background]
     aaplug.view(scene, cameras, words=command, **told(words, verbs.LiveOptions))
@@ -438,9 +436,7 @@ def bench(words: Words) -> Answer:
 
     To measure how close images come to the truth, use evaluate; to compile the fast rasterizer, warmup.
     """
-    scene = cameras = None
-    if words.scene is not None or words.model_path is not None:
-        scene, cameras = read_inputs(words)
+    scene, cameras = read_inputs(words) if words.scene or words.model_path else (None, None)
     runs, exponents = aaplug.bench(scene, cameras, **told(words, verbs.BenchOptions))
     from aaplug.system.executors import given_threads
 
