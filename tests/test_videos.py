@@ -1,6 +1,7 @@
 """Videos: every frame, padded and never resampled, whole or not at all."""
 
 import json
+import math
 from pathlib import Path
 
 import av
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from aaplug import read_cameras
+from aaplug.evaluation.report.contact_sheet import side_by_side
 from aaplug.io.video import write_video
 from aaplug.system.errors import OutputError, UsageError
-from aaplug.verbs.video import side_by_side
 from tests.conftest import files_of_at_most
 from tests.test_camera_paths import document
 
@@ -95,22 +97,36 @@ def test_a_disk_that_is_full_is_named(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_becomes_small_is_also_shown_enlarged():
-    image = torch.ones(400, 600, 3)
-    image[190:210, 290:310] = torch.rand(20, 20, 3)  # a thing of 20 px in the middle
+@pytest.mark.parametrize(("height", "width"), [(400, 600), (240, 320)])
+def test_what_becomes_small_is_also_shown_enlarged(height, width):
+    image = torch.ones(height, width, 3)
+    y, x = (slice(side // 2 - 10, side // 2 + 10) for side in (height, width))
+    image[y, x] = torch.rand(20, 20, 3)  # a thing of 20 px in the middle
     for rate, times in ((1 / 8, 7), (1 / 4, 3)):
-        [left, right] = side_by_side([image, image], ["a", "b"], rate).split([600, 604], dim=1)
-        side = int((1 - rate) / 2 * 400 - 2) // times
+        [left, right] = side_by_side([image, image], ["a", "b"], rate).split([width, width + 4], dim=1)
+        side = int((1 - rate) / 2 * height - 2) // times
         for pane in (left, right[:, 4:]):
-            inset = pane[400 - side * times :, 600 - side * times :]
-            top, across = (400 - side) // 2, (600 - side) // 2
+            inset = pane[height - side * times :, width - side * times :]
+            top, across = (height - side) // 2, (width - side) // 2
             middle = image[top : top + side, across : across + side]
             expected = middle.repeat_interleave(times, dim=0).repeat_interleave(times, dim=1)
             assert torch.allclose(inset, expected, atol=0.5 / 255)
-            assert side >= rate * 400 / 2 - 1  # half of what the data set's view shows
-            assert torch.allclose(pane[190:210, 290:310], image[190:210, 290:310], atol=0.5 / 255)
+            assert side >= rate * height / 2 - 1  # half of what the data set's view shows
+            assert torch.allclose(pane[y, x], image[y, x], atol=0.5 / 255)
     near = side_by_side([image, image], ["a", "b"], 1.0)
-    assert torch.allclose(near[40:, :600], image[40:], atol=0.5 / 255)
+    assert torch.allclose(near[40:, :width], image[40:], atol=0.5 / 255)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "equirect"])
+def test_a_video_tells_the_sampling_rate_of_its_pixels(cli, monkeypatch, lens):
+    told = []
+    monkeypatch.setattr("aaplug.verbs.video.side_by_side", lambda images, *how: (told.append(how[-1]), images[0])[1])
+    size = (320, 160) if lens == "equirect" else (320, 240)
+    words = f"--lens {lens} --resolution {size[0]}x{size[1]} --path dolly --seconds 0.2 --fps 20"
+    cli.done(f"video scene.ply --cameras . -o v.webm {words}")
+    training = read_cameras(".").train[0]
+    focal = size[0] / (2 * math.pi) if lens == "equirect" else training.resized(*size).focal
+    assert told[2] == pytest.approx(focal / training.focal / 8, rel=0.15)  # eight times as far away
 
 
 def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):

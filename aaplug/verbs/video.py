@@ -106,7 +106,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
             return torch.cat([*images], dim=1)
         receding = str(options.path) in RECEDING_PATHS
         rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
-        return side_by_side(images, labels, rate, min(views[index].hw) / min(path.cameras[index].hw))
+        return side_by_side(images, labels, rate, renderers[-1].relative_rate(views[index]) if rate < 1 else 1.0)
 
     path_file = [] if file is None else [str(options.path)]
     place = target if sequence is None else sequence.pattern.parent

@@ -93,14 +93,14 @@ def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> F
 
 
 def side_by_side(
-    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str], rate: float = 1.0, size: float = 1.0
+    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str], rate: float = 1.0, sampling: float = 1.0
 ) -> Float[Tensor, "h w 3"]:
     """Images from left to right, each with its label; a single image stays as it is.
 
     rate: size of things against the data set's view.  Where it falls, the middle is also shown enlarged in the bottom
         right corner, each pixel as a sharp square.  The inset stays outside of these things, and shows half of them
         along each side, or a little more; without room for `MIN_INSET` px there is none.
-    size: of the images, relative to the training size.
+    sampling: the images' sampling rate relative to training, which stands below the label then.
     """
     if len(images) == 1:
         return images[0]
@@ -117,8 +117,7 @@ def side_by_side(
             y, x = height - len(inset), width - len(inset)
             pixels[y - FRAME :, x - FRAME :] = FRAME_INK
             pixels[y:, x:] = inset
-            words = f"{rate * size:.2f} of training's sampling, {times}x"
-            _write_on_strip(pixels, words, max(0, width - _text_width(words) - 2 * GAP), y - FRAME - HEADING)
+            _write_on_strip(pixels, f"{sampling:.2g} of training's sampling, {times}x", 0, HEADING)
         _write_on_strip(pixels, label, 0, 0)
         panes += [np.zeros((height, PANE_GAP, 3), dtype=np.uint8), pixels]
     return torch.from_numpy(np.concatenate(panes[1:], axis=1)).float() / BYTE
