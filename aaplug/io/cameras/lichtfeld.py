@@ -1,9 +1,10 @@
-"""The timeline of LichtFeld Studio's sequencer, versions 1 to 4 (`src/sequencer/timeline.cpp`, 2026).
+"""The timeline of LichtFeld Studio's sequencer, versions 2 to 4 (`src/sequencer/timeline.cpp`, 2026).
 
 {version, keyframes: [{time, position, rotation, focal_length_mm, easing}]}.  time: in s; position: of the camera, in
 scene units; rotation: camera-to-world, wxyz, OpenGL axes; easing: of the way to the next key, 0 even, 1 in, 2 out, 3 in
 and out, cubic.  The world's y and z point against those of the scene.  The focal length is that of a sensor 24 mm high.
-Positions lie on a Catmull-Rom spline.  The file has no frame rate and no size.  Older versions eased otherwise.
+Positions lie on a Catmull-Rom spline.  The file has no frame rate and no size.  Older versions eased otherwise;
+version 1 has an angle of view for the focal length, and is not known by its keys.
 """
 
 from pathlib import Path
