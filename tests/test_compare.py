@@ -248,9 +248,9 @@ def test_files_and_a_continued_run(cli, monkeypatch, plots_drawn_once, texts):
 
 def test_pictures_hold_no_sign_that_the_font_lacks(texts):
     image = torch.zeros(400, 400, 3)
-    side_by_side([image, image], ["4× – é ∞ 日", "½×"], 0.1)
+    side_by_side([image, image], ["4× – é ∞ 日", "½×"], 0.1, 0.25)
     contact_sheet(("a×", "b×"), [(2.0, (image, image))])
-    enlarged = "0.10 of training's sampling, 9x"
+    enlarged = "0.25 of training's sampling, 9x"
     assert texts == [enlarged, "4x - e inf ?", enlarged, "1?2x", "ax", "bx", "2x: 400x400", "equal"]
 
 
