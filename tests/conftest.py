@@ -370,16 +370,13 @@ def straight_camera(
     return Camera("straight", *size, focal, focal, *(centre or (size[0] / 2, size[1] / 2)), pose)
 
 
-def sized(scene: Gaussians, always: bool = False) -> Gaussians:
+def sized(scene: Gaussians) -> Gaussians:
     """The scene with the columns that recipes read: pixel sizes of Multi-Scale 3DGS, and learned filters.
 
     By the first, in most views some Gaussians are too small or too large.
-
-    always: every Gaussian is drawn at every size.
     """
     n = len(scene)
-    base = (torch.arange(n) % 4 == 0) | always
-    sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
+    sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), torch.arange(n) % 4 == 0)
     learned = {name: torch.linspace(-0.3, 0.3, n).roll(k) for k, name in enumerate(NAMES)}
     return replace(scene, extras=sizes.extras | learned)
 

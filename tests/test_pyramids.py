@@ -34,7 +34,6 @@ from aaplug.methods.presets import find_recipe, recipe_of
 from aaplug.methods.recipe import LevelChoice, Recipe
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import visibility
-from aaplug.system.digests import digest_of_files
 from aaplug.system.executors import torch_threads
 from tests.conftest import made_by, make_camera, make_scene, make_splats
 
@@ -47,20 +46,16 @@ def rates(scene: Gaussians) -> torch.Tensor:
     return torch.full((len(scene),), RATE)
 
 
-def pyramid(n: int = 300, levels: int = 3, largest: int = 40) -> Pyramid:
+@pytest.fixture(scope="module")
+def levels() -> Pyramid:
     """Merged without tuning."""
-    scenes, chunks = [make_scene(n)], [chunks_of(make_scene(n).means, largest)]
-    for level in range(1, levels + 1):
+    scenes, chunks = [make_scene(300)], [chunks_of(make_scene(300).means, 40)]
+    for level in range(1, 4):
         goal = Goal(0.5**level, tolerance=1e-2)
         scene, _, places, _ = merge(scenes[-1], rates(scenes[-1]), goal, chunks=chunks[-1])
         scenes.append(scene)
         chunks.append(places)
     return Pyramid.of(scenes, chunks)
-
-
-@pytest.fixture(scope="module")
-def levels() -> Pyramid:
-    return pyramid()
 
 
 @pytest.fixture(scope="module")
@@ -352,16 +347,6 @@ def in_manifest(**changes):
     return change
 
 
-def test_a_levels_hash_covers_all_of_its_bytes(tmp_path):
-    data = bytearray(1 << 20)
-    hashes = set[str]()
-    for place in (0, 1 << 17, 1 << 19, len(data) - 1):
-        data[place] = 1
-        (tmp_path / "level.ply").write_bytes(data)
-        hashes.add(digest_of_files([tmp_path / "level.ply"]))
-    assert len(hashes) == 4
-
-
 BROKEN = {
     "missing": (lambda level, _: level.unlink(), "scene_lod1.ply: is missing"),
     "truncated": (lambda level, _: level.write_bytes(level.read_bytes()[:-7]), "scene_lod1.ply: is not the level"),
@@ -439,8 +424,7 @@ def test_a_level_is_tuned_over_the_rates_that_draw_it_and_on_free_poses_too(samp
     assert max(view.width for view in views) == poses[0].width
 
 
-TWO = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0)))
-CAMERAS = CameraSet(TWO, TWO)
+CAMERAS = CameraSet(VIEWS[:2], VIEWS[:2])
 
 
 def in_one_chunk(*counts: int) -> Pyramid:
@@ -463,7 +447,7 @@ def limited_to(levels: Pyramid, **choice: float) -> Renderer:
 )
 def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(budget, share, expected):
     """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 has 4 samples, at the rate of level 1."""
-    limited, view = limited_to(in_one_chunk(200, 50, 45, 5), budget=budget, share=share), TWO[0].scaled(1 / 8)
+    limited, view = limited_to(in_one_chunk(200, 50, 45, 5), budget=budget, share=share), VIEWS[0].scaled(1 / 8)
     fine, samples = limited.sampled(view)
     assert samples == limited.samples(view) == 4
     assert limited.coarsening(fine, samples) == expected
@@ -477,28 +461,28 @@ def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(bud
 def test_levels_of_several_samples_stay_as_fine_as_the_quality_asks(quality, expected):
     levels = in_one_chunk(200_000, 150_000, 120_000)
     renderer = Renderer.of(levels, CAMERAS, quality=quality, rasterizer="eager")
-    assert renderer.coarsening(TWO[0].scaled(1 / 2), 2) == expected
+    assert renderer.coarsening(VIEWS[0].scaled(1 / 2), 2) == expected
 
 
 @pytest.mark.parametrize("scale", [1 / 4.17, 1 / 5, 1 / 9, 1 / 10, 1 / 10.5])
 def test_where_no_level_is_light_enough_the_lightest_is_drawn_alone(scale):
     """And not two that fade."""
     limited = limited_to(in_one_chunk(200, 150, 120))
-    fine, samples = limited.sampled(TWO[0].scaled(scale))
+    fine, samples = limited.sampled(VIEWS[0].scaled(scale))
     assert limited.cutter is not None
     assert limited.cutter(fine, limited.coarsening(fine, samples)).shares is None
 
 
 def test_evaluation_tells_apart_recipes_that_draw_different_levels():
     levels = in_one_chunk(200, 150, 20)
-    training = TrainingViews.of(levels.finest, TWO)
+    training = TrainingViews.of(levels.finest, VIEWS[:2])
     fine = find_recipe("auto")
     coarse = replace(fine, name="coarse", levels=LevelChoice())
     truth = Truth(own_look(levels.finest, training, "eager"))
 
     def figures(*recipes: Recipe) -> list[float | None]:
         renderers = renderers_of(own_look(levels, training, "eager"), recipes)
-        report = evaluate(Task(renderers, (1 / 8,), TWO[:1], truth))
+        report = evaluate(Task(renderers, (1 / 8,), VIEWS[:1], truth))
         return [mean(report.select(recipe.name, 1 / 8), "PSNR") for recipe in recipes]
 
     assert figures(fine, coarse) == [*figures(fine), *figures(coarse)]
