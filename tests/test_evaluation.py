@@ -424,21 +424,15 @@ def test_recipes_rank_as_measured_on_the_sample(sample_scene, sample_cameras, sa
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
-def test_scale_one_is_the_view_itself_and_names_exist(protocol):
-    view = make_camera()
-    camera = protocol.camera(view, 1.0, 4.0)
-    assert (camera.hw, camera.intrinsics) == (view.hw, view.intrinsics)
-    assert camera.cam_from_world.equal(view.cam_from_world)
-    assert (protocol.downscale in DOWNSCALES, protocol.ssim in SSIM, bool(protocol.source)) == (True, True, True)
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
-@pytest.mark.parametrize("scale", [0.25, 2.0])
-def test_every_protocol_samples_what_is_in_the_middle_by_the_scale(protocol, scale):
+def test_every_protocol_samples_what_is_in_the_middle_by_the_scale_of_which_one_is_the_view_itself(protocol):
     view = make_camera((0.0, -4.0, 0.0))
-    camera = protocol.camera(view, scale, 4.0)
-    depth = camera.cam_from_world[2, 3].item()  # of the world's origin, which the view looks at
-    assert camera.fx / depth == pytest.approx(scale * view.fx / 4.0)
+    half, same, double = (protocol.camera(view, scale, 4.0) for scale in (0.5, 1.0, 2.0))
+    for camera, scale in ((half, 0.5), (double, 2.0)):
+        depth = camera.cam_from_world[2, 3].item()  # of the world's origin, which the view looks at
+        assert camera.fx / depth == pytest.approx(scale * view.fx / 4.0)
+    assert (same.hw, same.intrinsics) == (view.hw, view.intrinsics)
+    assert same.cam_from_world.equal(view.cam_from_world)
+    assert (protocol.downscale in DOWNSCALES, protocol.ssim in SSIM, bool(protocol.source)) == (True, True, True)
 
 
 def test_cameras_of_moved_and_of_whole_sized_protocols():
@@ -494,18 +488,15 @@ def test_a_torn_line_is_forgotten_and_written_again(path, end, views):
     assert path.read_bytes() == whole
 
 
-def test_another_request_is_refused_by_what_changed_until_the_journal_is_removed(path):
+def test_another_request_is_refused_by_what_changed_until_the_journal_is_begun_anew_or_removed(path):
     other = {"scales": [1.0], "views": 3, "versions": {"aaplug": "1", "torch": "3"}}
     with pytest.raises(UsageError, match=r"another aaplug \(scales, versions.torch changed.* or remove the file"):
         Journal(path, other, resume=True)
-    path.unlink()
-    assert not Journal(path, other, resume=True).views
-
-
-def test_without_resume_it_starts_anew(path):
-    with Journal(path, REQUEST | {"views": 9}, resume=False) as journal:
+    with Journal(path, other, resume=False) as journal:
         journal.add(0, [measured("c")])
     assert len(path.read_text().splitlines()) == 2
+    path.unlink()
+    assert not Journal(path, other, resume=True).views
 
 
 def test_two_processes_do_not_share_a_journal(path):

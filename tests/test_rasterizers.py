@@ -370,13 +370,14 @@ def test_when_saturated_tiles_are_dropped_changes_no_bit(monkeypatch):
 
 
 @pytest.mark.parametrize("rows", [[], [4], [5, 0, 3], list(range(9))], ids=str)
-def test_selected_splats_are_those_of_the_rows_and_pass_gradients_on(rows):
+def test_chosen_splats_are_those_of_the_rows_in_order_and_pass_gradients_on(rows):
     splats = make_splats(9, (20, 20), 3, (0.0, 1.0)).to(F64)
     splats = replace(splats, depth_slopes=torch.ones(9, 2, dtype=F64), means=splats.means.requires_grad_())
     index = torch.tensor(rows, dtype=torch.long)
     found = splats.selected(index)
-    for name, column in splats._columns().items():
-        assert getattr(found, name).equal(column[index])
+    for choice, part in ((index, found), (index.repeat(2), splats[index.repeat(2)]), (slice(2, 5), splats[2:5])):
+        for name, column in splats._columns().items():
+            assert getattr(part, name).equal(column[choice]), name
     (grad,) = torch.autograd.grad(found.means.sum() + 0 * splats.means.sum(), splats.means)
     assert grad.equal(torch.zeros(9, 2, dtype=F64).index_fill(0, index, 1.0))
 

@@ -125,14 +125,6 @@ def test_culling_drops_splats_that_cannot_be_drawn_and_keeps_an_opacity_of_exact
             assert not len(cull(replace(faintest, **{name: torch.tensor(value, dtype=dtype)}), (40, 40))), value
 
 
-def test_indexing_keeps_every_column_and_the_order():
-    splats = make_splats(6, (20, 20))
-    for index in (torch.tensor([4, 1, 1]), torch.arange(6) % 2 == 0, slice(2, 5)):
-        part = splats[index]
-        for name in ("means", "covs", "dets", "depths", "opacities", "sources", "rgb"):
-            assert getattr(part, name).equal(getattr(splats, name)[index]), name
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1e-7, 3e-8, 1e-8, 1e-12, 1e-20, 1e-30])
 @pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 2.0, 1e4, 1e30])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])

@@ -3,7 +3,7 @@
 import math
 import statistics
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -20,15 +20,6 @@ SHARE = 0.005  # of the cameras' extent, by which they are moved, in random dire
 EXTENT_MARGIN = 1.1  # of the largest distance of a camera from the middle of all, as 3DGS takes the extent
 
 
-@dataclass(frozen=True)
-class Figures:
-    """Of one view: what is left of the error; PSNR at full size below that of the true pose, in dB."""
-
-    degrees: float
-    share: float
-    loss: float
-
-
 def main(views: int = 25) -> None:
     """Print the figures of so many test views of the chair."""
     torch.set_num_threads(1)
@@ -39,7 +30,7 @@ def main(views: int = 25) -> None:
     generator = torch.Generator().manual_seed(1)
     heading(f"the chair, {views} views", "poses", "", "angle, °", "distance, % of extent", "dB below the true pose")
     for name, off in (("off", 1.0), ("true", 0.0)):
-        started, figures = time.process_time(), list[Figures]()
+        started, figures = time.process_time(), list[tuple[float, float, float]]()
         for view in opened.views(views):
             axis, way = normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=1)
             turn = torch.from_numpy(Rotation.from_rotvec(off * math.radians(DEGREES) * axis.numpy()).as_matrix())
@@ -49,15 +40,15 @@ def main(views: int = 25) -> None:
             start = replace(view, cam_from_world=pose)
             figures.append(_figures(renderer, view, refine_pose(renderer, start), extent))
         for what, of in (("median", statistics.median), ("worst", max)):
-            columns = zip(*((f.degrees, 100 * f.share, f.loss) for f in figures), strict=True)
-            row(name, what, *(f"{of(column):.3f}" for column in columns))
+            row(name, what, *(f"{of(column):.3f}" for column in zip(*figures, strict=True)))
         print(f"{(time.process_time() - started) / len(figures):.1f} s of processor time a view", flush=True)
 
 
 @torch.no_grad()
-def _figures(renderer: Renderer, view: Camera, found: RefinedPose, extent: float) -> Figures:
+def _figures(renderer: Renderer, view: Camera, found: RefinedPose, extent: float) -> tuple[float, float, float]:
+    """What is left of the error in degrees and in percent of the extent; dB of PSNR lost to the true pose's."""
     chord = float((found.camera.cam_from_world - view.cam_from_world)[:3, :3].norm())  # √8 sin(angle / 2)
     photo = photo_of(view, renderer.background)(view)
     loss = decibels(renderer(view).rgb, photo) - decibels(renderer(found.camera).rgb, photo)
     share = float((found.camera.centre - view.centre).norm()) / extent
-    return Figures(math.degrees(2 * math.asin(chord / math.sqrt(8))), share, loss)
+    return math.degrees(2 * math.asin(chord / math.sqrt(8))), 100 * share, loss

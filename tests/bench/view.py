@@ -14,8 +14,7 @@ import statistics
 import struct
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -43,7 +42,9 @@ def main(gaussians: Sequence[int] = (100_000, 550_000, 1_000_000), seconds: floa
 
 def fly_together(gaussians: int, clients: int, seconds: float) -> None:
     """Print one line of the table."""
-    with _served(gaussians) as (address, view):
+    trained = synthetic_camera(*WINDOW).as_trained()
+    view, cameras = replace(trained, trained_focal=None), CameraSet((trained,), (trained,))
+    with serving(synthetic_scene(gaussians), cameras, port=0, no_browser=True) as address:
         Flight().fly(address, view, 2.0)  # warms up
         flights = [Flight() for _ in range(clients)]
         threads = [threading.Thread(target=flight.fly, args=(address, view, seconds)) for flight in flights]
@@ -61,14 +62,6 @@ def fly_together(gaussians: int, clients: int, seconds: float) -> None:
         f"{sum(flight.bytes for flight in flights) / seconds / 1e6:.1f}",
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
     )
-
-
-@contextmanager
-def _served(gaussians: int) -> Iterator[tuple[str, Camera]]:
-    """The address of a page with a synthetic scene, and a free camera of it."""
-    view = synthetic_camera(*WINDOW).as_trained()
-    with serving(synthetic_scene(gaussians), CameraSet((view,), (view,)), port=0, no_browser=True) as address:
-        yield address, replace(view, trained_focal=None)
 
 
 @dataclass

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug import PIXEL_KERNELS, RULES_3DGS, Camera, Gaussians, Limits, Pixels, Splats2D
+from aaplug import PIXEL_KERNELS, RULES_3DGS, Camera, Gaussians, Limits, Pixels, Renderer, Splats2D
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
 from aaplug.evaluation.laws.drawing import COARSE, require_bounds, some_splats
 from aaplug.lab.integral import INTEGRAL
@@ -19,7 +19,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.rasterizers.tiled import Tiled
-from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, splats_of
+from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, splats_of, straight_camera
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
@@ -101,6 +101,25 @@ def on_disc(scene: Gaussians, sources: Tensor, camera: Camera) -> Callable[[Tens
         return torch.einsum("nij,ni->nj", axes, point)[:, :2] / scales
 
     return local
+
+
+def test_a_disc_whose_centre_is_far_outside_of_the_image_is_drawn_where_rays_meet_it():
+    """2DGS intersects every ray exactly: nothing is linearised at a place that is clamped to the widened image."""
+    camera, half = straight_camera(32.0, (24, 18)), math.radians(60) / 2
+    disc = replace(
+        discs(1),
+        means=torch.tensor([[3.0, 0.0, 4.0]], dtype=F64),
+        quats=torch.tensor([[math.cos(half), 0.0, math.sin(half), 0.0]], dtype=F64),
+        log_scales=torch.tensor([[0.0, 0.0, -30.0]], dtype=F64),
+        logit_opacities=torch.tensor([3.0], dtype=F64),
+        flat=True,
+    )
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=F64) + 0.5 for side in camera.hw), indexing="ij")
+    met = on_disc(disc, torch.zeros(x.numel(), dtype=torch.long), camera)(torch.stack([x, y], dim=2).flatten(0, 1))
+    expected = (disc.opacities * torch.exp(-0.5 * met.square().sum(dim=1))).view_as(x)
+    alpha = Renderer.of(disc, [camera], "2dgs", rasterizer="eager", min_seen=0.0)(camera).alpha
+    assert expected.max() > 0.05
+    torch.testing.assert_close(alpha, torch.where(expected < 1 / 255, 0.0, expected), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -0.3), (2.0, -1.5)])
