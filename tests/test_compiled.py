@@ -134,6 +134,7 @@ def copied_cache(built, empty_cache):
 
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="bundles are Linux's")
+march = pytest.mark.skipif(not hasattr(torch._inductor.config.cpp, "march"), reason="this torch tells g++ no options")
 
 
 @linux
@@ -182,28 +183,27 @@ def test_packages_are_compared_by_one_thread_which_is_undone_after_that(copied_c
 
 
 @linux
+@march
 @pytest.mark.parametrize("counted", [True, False])
 def test_a_compiler_counts_registers_where_there_are_few(counted, monkeypatch):
-    if not hasattr(torch._inductor.config.cpp, "march"):
-        pytest.skip("this torch does not tell g++ the architecture")
     monkeypatch.setattr(compiled.platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2" if counted else "AVX512")
     kernels = forward.pass_kernel(point.POINT), backward.step_kernel(point.POINT)
     passes, step = (compiled._configs(kernel)["cpp.march"] for kernel in kernels)
-    assert ("-fsched-pressure" in passes) == counted
     assert "-fsched-pressure" in step  # it keeps many sums
-    assert ("-mprefer-vector-width=512" in passes) == (not counted)  # else vectors are copied by halves
-    for target in compiled.TARGETS:
-        march = compiled._configs(kernels[0], target)["cpp.march"]
-        assert march.startswith(target.name)
-        assert ("-fsched-pressure" in march) == (target.capability == "AVX2")
-        assert ("-mprefer-vector-width=512" in march) == (target.capability == "AVX512")
+    bundled = {compiled._configs(kernels[0], target)["cpp.march"]: target for target in compiled.TARGETS}
+    assert all(options.startswith(target.name) for options, target in bundled.items())
+    few = {passes: counted} | {options: target.capability == "AVX2" for options, target in bundled.items()}
+    for options, expected in few.items():
+        assert ("-fsched-pressure" in options) == expected
+        assert ("-mprefer-vector-width=512" in options) == (not expected)  # else vectors are copied by halves
 
 
 GCC_11 = "g++-11 (Debian 11.3.0-12) 11.3.0\nCopyright (C) 2021 Free Software Foundation, Inc."
 
 
 @linux
+@march
 @pytest.mark.parametrize(
     ("machine", "words", "options"),
     [
@@ -214,8 +214,6 @@ GCC_11 = "g++-11 (Debian 11.3.0-12) 11.3.0\nCopyright (C) 2021 Free Software Fou
     ],
 )
 def test_a_compiler_gets_its_options_whatever_its_file_is_called(machine, words, options, monkeypatch):
-    if not hasattr(torch._inductor.config.cpp, "march"):
-        pytest.skip("this torch does not tell a compiler the architecture")
     monkeypatch.setattr(compiled.platform, "machine", lambda: machine)
     monkeypatch.setenv("CXX", "/opt/conda/bin/x86_64-conda-linux-gnu-c++")
     monkeypatch.setattr(compiled, "_compiler_version", lambda compiler: words)
@@ -243,10 +241,9 @@ def test_headers_are_precompiled_where_their_digest_can_be_computed(monkeypatch)
 
 
 @linux
+@march
 def test_a_library_asks_for_no_executable_stack(built):
     """glibc 2.41 loads no library that does, and a bundle may be compiled elsewhere."""
-    if not hasattr(torch._inductor.config.cpp, "march"):
-        pytest.skip("this torch does not tell a compiler its options")
     segment_of_stack, executes = 0x6474E551, 1  # as elf(5) numbers them
     content = compiled.package_path(binning.PAIRS).with_suffix(".so").read_bytes()
     (start,), (size, count) = struct.unpack_from("<Q", content, 32), struct.unpack_from("<2H", content, 54)

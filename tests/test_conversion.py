@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import aaplug
-from aaplug import RECIPES, CameraSet, Fusion, Rules, TrainingViews, UsageError, read_scene, write_scene
+from aaplug import CameraSet, Fusion, Rules, TrainingViews, UsageError, read_scene, write_scene
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
 from aaplug.core.placing import mirrored, placed
 from aaplug.core.projection import project, rotation_matrices
@@ -21,21 +21,9 @@ from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import DISC_VIEWER, VIEWERS
 from aaplug.rendering.agreement import photo_of
-from aaplug.rendering.renderer import Renderer, own_look
+from aaplug.rendering.renderer import own_look
 from tests.conftest import make_camera, make_scene, moved
 from tests.scene_files import oracle
-
-
-@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS.keys())
-def test_a_converted_scene_renders_the_same_from_its_file(form, tmp_path, cameras):
-    scene = make_scene(200)
-    training = TrainingViews.of(scene, cameras)
-    converted = fuse(scene, training, form)
-    write_scene(tmp_path / "converted.ply", converted)
-    again = read_scene(tmp_path / "converted.ply").gaussians()
-    assert (again.convention, again.fused) == (MIP, converted.fused)
-    images = [Renderer(s, training, RECIPES["mip"])(cameras[0]).rgb for s in (converted, again)]
-    assert torch.equal(*images)
 
 
 def test_what_cannot_be_fused_is_refused(cameras):

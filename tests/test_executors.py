@@ -255,6 +255,7 @@ if __name__ == "__main__":
         os.wait()
 """
 HELD = "the program's", "the pool's", "the item's"  # folders of temporary files
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
 ENDS = {"SIGTERM": os.kill, "SIGHUP": os.killpg, "SIGKILL": os.kill}  # of a parent alone, and with its group
 
 
@@ -264,8 +265,7 @@ def test_no_worker_outlives_its_program_and_no_temporary_file_one_that_can_answe
     script.write_text(HOLD)
     for folder in folders:
         folder.mkdir()
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    with subprocess.Popen([sys.executable, str(script), *map(str, folders)], env=environment) as starter:
+    with subprocess.Popen([sys.executable, str(script), *map(str, folders)], env=ENVIRONMENT) as starter:
         while starter.poll() is None and not all(len([*f.glob("aaplug-scratch-*")]) == len(HELD) for f in folders):
             time.sleep(0.01)
         parents = [psutil.Process(int(folder.with_suffix(".pid").read_text())) for folder in folders]
@@ -382,9 +382,8 @@ if __name__ == "__main__":
 def test_threads_forked_processes_and_pools_draw_the_same_bits_as_one(tmp_path):
     script = tmp_path / "draw.py"
     script.write_text(SAME_BITS)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     words = [sys.executable, str(script)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=300, check=False)
     assert done.stdout.splitlines() == ["forked [0, 0]", "threads True", "pool True", "processes True"], done.stderr
 
 

@@ -232,50 +232,39 @@ def composited(
     return image, 1 - left
 
 
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("channels", [1, 3, 5])
-def test_images_equal_the_formula(mode, channels):
+@pytest.mark.parametrize(
+    ("lens", "mode", "channels"),
+    [(None, "classic", 1), (None, "classic", 5), (None, "antialiased", 3), *((x, "classic", 3) for x in LENSES)],
+)
+def test_colours_and_depth_equal_the_formula_over_a_background_and_depth_may_be_divided_by_alpha(lens, mode, channels):
     values, views = gaussians() | {"colors": torch.rand(40, channels, dtype=F64)}, two_views()
     # two opaque bright splats, each in the middle of one image
     values["means"][:2], values["opacities"][:2], values["scales"][:2] = 0.5 * torch.tensor(EYES), 1.0, 0.2
     values["colors"][:2] = 1.0
-    image, alpha, meta = rasterization(**values, **views, packed=False, rasterize_mode=mode)
-    assert image.shape == (2, SIZE[1], SIZE[0], channels)
-    for camera in range(2):
-        expected = composited(meta, values["colors"], camera)
-        torch.testing.assert_close(image[camera], expected[0], rtol=0, atol=1e-6)
-        torch.testing.assert_close(alpha[camera], expected[1], rtol=0, atol=1e-6)
-        capped = composited(meta, values["colors"], camera, 0.99)[0]
-        assert mode == "antialiased" or (expected[0] - capped).abs().max() > 1e-4, "the cap should matter here"
-
-
-@pytest.mark.parametrize("lens", [None, "distorted", "fisheye", "ortho"])
-def test_depth_is_summed_by_weight_and_may_be_divided_by_alpha(lens):
-    values, views = gaussians(), two_views()
-    views |= lens_words(lens, 2) if lens else {}
-    backgrounds = torch.ones(2, 3, dtype=F64)
-    images = {
-        mode: rasterization(**values, **views, render_mode=mode, backgrounds=backgrounds, packed=False)
-        for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-    }
+    words = {"rasterize_mode": mode, "backgrounds": torch.rand(2, channels, dtype=F64), "packed": False}
+    words |= views | (lens_words(lens, 2) if lens else {})
+    modes = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+    images = {mode: rasterization(**values, **words, render_mode=mode) for mode in modes}
     _, alpha, meta = images["D"]
     depth, expected = images["D"][0], images["ED"][0]
-    for camera in range(2):
-        by_formula = composited(meta, meta["depths"][camera][:, None], camera)[0]
-        torch.testing.assert_close(depth[camera], by_formula, rtol=1e-5, atol=1e-6)
+    for camera, background in enumerate(words["backgrounds"]):
+        features = torch.cat([values["colors"], meta["depths"][camera][:, None]], dim=1)
+        by_formula, covered = composited(meta, features, camera)
+        capped = composited(meta, features, camera, 0.99)[0]
+        assert mode == "antialiased" or (by_formula - capped).abs().max() > 1e-4, "the cap should matter here"
+        by_formula[..., :channels] += (1 - covered) * background
+        torch.testing.assert_close(images["RGB"][0][camera], by_formula[..., :channels], rtol=0, atol=1e-6)
+        torch.testing.assert_close(depth[camera], by_formula[..., channels:], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(alpha[camera], covered, rtol=0, atol=1e-6)
     torch.testing.assert_close(expected[alpha > 0.01], (depth / alpha)[alpha > 0.01])
     assert (expected[alpha == 0] == 0).all()
     for mode, last in (("RGB+D", depth), ("RGB+ED", expected)):
         torch.testing.assert_close(images[mode][0], torch.cat([images["RGB"][0], last], dim=-1))
 
 
-def test_backgrounds_show_through():
-    values, views = gaussians(), two_views()
-    backgrounds = torch.rand(2, 3, dtype=F64)
-    black, alpha, _ = rasterization(**values, **views)
-    image, _, _ = rasterization(**values, **views, backgrounds=backgrounds)
-    torch.testing.assert_close(image, black + (1 - alpha) * backgrounds[:, None, None])
-    values["means"][:, 1] -= 100  # out of sight
+def test_nothing_is_drawn_of_what_is_out_of_sight():
+    values, views, backgrounds = gaussians(), two_views(), torch.rand(2, 3, dtype=F64)
+    values["means"][:, 1] -= 100
     image, alpha, meta = rasterization(**values, **views, backgrounds=backgrounds)
     assert (image == backgrounds[:, None, None]).all()
     assert (alpha == 0).all()

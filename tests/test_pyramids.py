@@ -350,6 +350,7 @@ def in_manifest(**changes):
 BROKEN = {
     "missing": (lambda level, _: level.unlink(), "scene_lod1.ply: is missing"),
     "truncated": (lambda level, _: level.write_bytes(level.read_bytes()[:-7]), "scene_lod1.ply: is not the level"),
+    "edited": (lambda level, _: level.write_bytes(level.read_bytes()[:-1] + b"!"), "scene_lod1.ply: is not the level"),
     "foreign": (lambda level, _: level.with_name("scene_lod2.ply").replace(level), "scene_lod1.ply: is not the level"),
     "newer": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 3}'), "should be version 2, not version 3"),
     "older": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 1}'), "lod --overwrite` makes the levels"),

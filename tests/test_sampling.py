@@ -82,10 +82,12 @@ def test_a_scene_that_no_camera_sees_is_no_crash_of_a_library():
         Smoothing3D()(scene, training)
 
 
-@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 2e-6)], ids=str)
-def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
-    means = (make_scene(200, seed=3).means * 3).to(dtype)
-    cameras = ring()
+@pytest.mark.parametrize(
+    ("dtype", "offset", "rtol"), [(torch.float64, 0.0, 1e-12), (torch.float32, 0.0, 2e-6), (torch.float32, 1.0, 2e-6)]
+)
+def test_bounds_agree_with_a_loop_in_float64_also_far_from_the_origin(dtype, offset, rtol):
+    means = (make_scene(200, seed=3).means.double() * 3 + offset * FAR).to(dtype)  # rounded to half units out there
+    cameras = [moved(camera, offset * FAR) for camera in ring()]
     bounds, median = sampling_bounds(means, cameras), median_rates(means, cameras)
     expected = [rates_by_loop(mean, cameras) for mean in means.tolist()]
     counts = [len(rates) for rates in expected]
@@ -150,17 +152,6 @@ def test_of_many_cameras_only_those_that_may_see_a_part_of_the_scene_are_compare
     assert all(map(torch.equal, vars(parts).values(), vars(whole).values()))
     pairs = sum(rates.numel() for *_, rates in rates_in_chunks(means, cameras))
     assert pairs < len(means) * len(cameras) / 10
-
-
-def test_bounds_of_a_scene_far_from_the_origin_are_exact():
-    means = (make_scene(100).means.double() * 3 + FAR).float()  # rounded to half units out there
-    cameras = [moved(camera, FAR) for camera in ring()]
-    exact = sampling_bounds(means.double(), cameras)
-    bounds = sampling_bounds(means, cameras)
-    assert 0 < exact.seen.sum() < 100
-    assert bounds.views.equal(exact.views)
-    torch.testing.assert_close(bounds.highest.double(), exact.highest, rtol=2e-6, atol=0)
-    torch.testing.assert_close(bounds.lowest.double(), exact.lowest, rtol=2e-6, atol=0)
 
 
 @pytest.mark.parametrize("find", [sampling_bounds, median_rates, view_information])
