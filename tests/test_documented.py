@@ -127,8 +127,13 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_scene(folder / name, scene)
     for name in ("path/to/colmap", "chair", "toy"):
         write_cameras(folder / name)
+    cameras, photographs = read_cameras(folder / "chair"), folder / "chair" / "test"
+    arguments = "eval=True, images='images', resolution=1, white_background=True"
     for name in ("scene", "garden", "bicycle"):
-        write_photographed_model(folder / "output" / name, scene, folder / "chair")
+        model = write_model(folder / "output" / name, (*cameras.test, *cameras.train), arguments, scene, 7)
+        shutil.copytree(photographs, model / "images")
+        for camera in cameras.train:
+            shutil.copy(photographs / "r_8.png", model / "images" / f"{camera.name}.png")
     (folder / "trainer.py").write_text(TRAINER)
     (folder / "camera_path.json").write_text(json.dumps(camera_path(folder / "chair")))
     for block in TABLES:
@@ -149,16 +154,6 @@ def write_cameras(folder: Path) -> None:
     for name in ("r_8.png", "r_24.png"):
         with Image.open(SAMPLE / "test" / name) as image:
             image.resize((SIZE, SIZE)).save(folder / "test" / name)
-
-
-def write_photographed_model(folder: Path, scene: Gaussians, photographs: Path) -> None:
-    """An INRIA model folder with the test cameras and their photographs."""
-    cameras = read_cameras(photographs)
-    arguments = "eval=True, images='images', resolution=1, white_background=True"
-    write_model(folder, (*cameras.test, *cameras.train), arguments, scene, 7)
-    shutil.copytree(photographs / "test", folder / "images")
-    for camera in cameras.train:
-        shutil.copy(photographs / "test" / "r_8.png", folder / "images" / f"{camera.name}.png")
 
 
 def camera_path(folder: Path) -> dict[str, object]:

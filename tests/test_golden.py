@@ -8,6 +8,7 @@ test_gsplat.py compares with gsplat's own code.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,16 +26,6 @@ SKY = (0.25, 0.5, 1.0)
 
 
 @dataclass
-class Stored:
-    """One Gaussian as plain arrays, activated."""
-
-    mean: np.ndarray
-    covariance: np.ndarray
-    opacity: float
-    sh: np.ndarray  # coefficients x 3
-
-
-@dataclass
 class Flat:
     """A Gaussian on the screen: (x, y) with pixel centres at +0.5, inverse covariance, and what is composited."""
 
@@ -46,10 +37,11 @@ class Flat:
     rgb: np.ndarray
 
 
-def stored(scene: Gaussians) -> list[Stored]:
+def stored(scene: Gaussians) -> Iterable[tuple[np.ndarray, np.ndarray, float, np.ndarray]]:
+    """Mean, covariance, opacity and harmonics (coefficients x 3) of each Gaussian, activated."""
     means, quats, log_scales, logits, sh = (column.double().numpy() for column in scene.columns.values())
     axes = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix() * np.exp(log_scales)[:, None]
-    return [*map(Stored, means, axes @ axes.transpose(0, 2, 1), 1 / (1 + np.exp(-logits)), sh)]
+    return zip(means, axes @ axes.transpose(0, 2, 1), 1 / (1 + np.exp(-logits)), sh, strict=True)
 
 
 def sh_colour(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -74,21 +66,14 @@ def sh_colour(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.maximum(np.array(basis[: len(sh)]) @ sh + 0.5, 0.0)
 
 
-def dilated(covariance: np.ndarray, compensated: bool) -> tuple[tuple[float, float, float], float]:
-    """Inverse of the covariance plus 0.3 px², and the factor on opacity."""
-    before = np.linalg.det(covariance)
-    a, b, c = covariance[0, 0] + 0.3, covariance[0, 1], covariance[1, 1] + 0.3
-    det = a * c - b * b
-    factor = math.sqrt(max(0.005**2, before / det)) if compensated else 1.0
-    return (c / det, -b / det, a / det), factor
-
-
-def projected(gaussian: Stored, camera: Camera, compensated: bool) -> Flat | None:
+def projected(
+    mean: np.ndarray, covariance: np.ndarray, opacity: float, sh: np.ndarray, camera: Camera, compensated: bool
+) -> Flat | None:
     """The principal point is the middle of the image: 3DGS knows fields of view only."""
     view = camera.cam_from_world.numpy()
     width, height = camera.width, camera.height
     tan_x, tan_y = 0.5 * width / camera.fx, 0.5 * height / camera.fy
-    x, y, z = view[:3, :3] @ gaussian.mean + view[:3, 3]
+    x, y, z = view[:3, :3] @ mean + view[:3, 3]
     if z <= 0.2:
         return None
     pixel_x = ((x / (z * tan_x) + 1) * width - 1) / 2
@@ -98,10 +83,12 @@ def projected(gaussian: Stored, camera: Camera, compensated: bool) -> Flat | Non
     ty = min(1.3 * tan_y, max(-1.3 * tan_y, y / z)) * z
     jacobian = np.array([[focal_x / z, 0, -focal_x * tx / z**2], [0, focal_y / z, -focal_y * ty / z**2]])
     to_screen = jacobian @ view[:3, :3]
-    conic, factor = dilated(to_screen @ gaussian.covariance @ to_screen.T, compensated)
-    centre = np.linalg.inv(view)[:3, 3]
-    rgb = sh_colour(gaussian.sh, gaussian.mean - centre)
-    return Flat(pixel_x + 0.5, pixel_y + 0.5, conic, z, gaussian.opacity * factor, rgb)
+    before = to_screen @ covariance @ to_screen.T
+    a, b, c = before[0, 0] + 0.3, before[0, 1], before[1, 1] + 0.3
+    det = a * c - b * b
+    factor = math.sqrt(max(0.005**2, np.linalg.det(before) / det)) if compensated else 1.0
+    rgb = sh_colour(sh, mean - np.linalg.inv(view)[:3, 3])
+    return Flat(pixel_x + 0.5, pixel_y + 0.5, (c / det, -b / det, a / det), z, opacity * factor, rgb)
 
 
 def composited(splats: list[Flat], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,7 +132,7 @@ def test_images_are_those_of_3dgs(degree, compensated):
     camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
     camera = replace(camera, fy=1.3 * camera.fy).as_trained()
     scene = replace(scene_of(degree, degree), convention=ANTIALIASED if compensated else CLASSIC)
-    drawn = [flat for gaussian in stored(scene) if (flat := projected(gaussian, camera, compensated)) is not None]
+    drawn = [flat for each in stored(scene) if (flat := projected(*each, camera, compensated)) is not None]
     assert 20 < len(drawn) < 70
     expected, alpha, close = (torch.from_numpy(x) for x in composited(drawn, camera))
     assert alpha.max() > 0.9998, "some pixels should stop"

@@ -97,23 +97,17 @@ def _matched(subject: Subject) -> Figure:
         ("classic at 1/4: r² C + 0.3 I", subject.seen("classic", RATE), RATE),
         ("Mip filter at 1/4: r² C + 0.1 I", subject.seen("mip", RATE), RATE),
     )
-    figure = _sheet(7.2)
+    figure, at, how = _sheet(7.2), np.linspace(-HALF, HALF, FINE), {"vmin": 0, "vmax": 1, "interpolation": "bilinear"}
+    offsets = np.stack(np.meshgrid(at, at), axis=-1)
     for axes, (title, seen, rate) in zip(figure.subplots(2, 3).flat, fields, strict=True):
-        _field(axes, seen, rate)
+        square = np.einsum("...i,ij,...j", offsets, np.linalg.inv(seen.cov), offsets)
+        alpha = seen.opacity * np.exp(-square / 2)
+        axes.imshow(alpha, cmap=LIGHT, extent=(-HALF, HALF, HALF, -HALF), **how)
+        axes.contour(at, at, square, [1.0], colors=COLOURS[1], linewidths=1.6)  # of one standard deviation
+        _grid(axes, seen.mean, 1 / rate)
         axes.set_title(title, fontsize=9.5)
         axes.set_xlabel(f"light: {seen.light / trained.light:.0%} of training's")
     return figure
-
-
-def _field(axes: Axes, seen: Seen, rate: float) -> None:
-    """Alpha over the plane, the pixels' grid, and the ellipse of one standard deviation."""
-    at = np.linspace(-HALF, HALF, FINE)
-    offsets = np.stack(np.meshgrid(at, at), axis=-1)
-    square = np.einsum("...i,ij,...j", offsets, np.linalg.inv(seen.cov), offsets)
-    box = (-HALF, HALF, HALF, -HALF)
-    axes.imshow(seen.opacity * np.exp(-square / 2), cmap=LIGHT, vmin=0, vmax=1, extent=box, interpolation="bilinear")
-    axes.contour(at, at, square, [1.0], colors=COLOURS[1], linewidths=1.6)
-    _grid(axes, seen.mean, 1 / rate)
 
 
 def _grid(axes: Axes, mean: np.ndarray, pixel: float) -> None:
@@ -128,8 +122,12 @@ def _places(subject: Subject) -> Figure:
     figure = _sheet(8.4)
     world, screen, kernel, samples = figure.subplots(2, 2).flat
     _world(world, subject)
+    angle = np.linspace(0, 2 * math.pi, FINE)
     for name, colour in (("none", COLOURS[1]), ("matched-global", COLOURS[0])):
-        _outline(screen, subject.seen(name, RATE), colour)
+        values, vectors = np.linalg.eigh(subject.seen(name, RATE).cov)
+        x, y = vectors @ (np.sqrt(values)[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
+        screen.plot(x, y, color=colour, lw=1.8)
+        screen.fill(x, y, color=colour, alpha=0.15)
     _grid(screen, subject.seen("none", RATE).mean, 1 / RATE)
     screen.set_title("2. screen filter: once per splat and view")
     screen.set_xlabel("as projected, and as matched widens it; pixels at 1/4")
@@ -151,14 +149,6 @@ def _world(axes: Axes, subject: Subject) -> None:
     axes.set_aspect("equal")
     axes.set_title("1. world filter: once per scene")
     axes.set_xlabel("before and after 3D smoothing; world units")
-
-
-def _outline(axes: Axes, seen: Seen, colour: str) -> None:
-    values, vectors = np.linalg.eigh(seen.cov)
-    angle = np.linspace(0, 2 * math.pi, FINE)
-    x, y = vectors @ (np.sqrt(values)[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
-    axes.plot(x, y, color=colour, lw=1.8)
-    axes.fill(x, y, color=colour, alpha=0.15)
 
 
 def _kernel(axes: Axes, subject: Subject) -> None:

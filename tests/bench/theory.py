@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from aaplug.evaluation.report.plots import COLOURS, Plot
@@ -29,38 +28,26 @@ def laws() -> Plot:
 def _figure(ink: str) -> Figure:
     figure = Figure((5.2, 6.2), layout="constrained")
     light, merging = figure.subplots(2)
-    _light(light, ink)
-    _merging(merging, ink)
-    return figure
-
-
-def _light(axes: Axes, ink: str) -> None:
     shares = {
         "classic": (RATES**2 * VARIANCE + KAPPA) / (RATES**2 * (VARIANCE + KAPPA)),
         "compensated against C": np.full(len(RATES), VARIANCE / (VARIANCE + KAPPA)),
         "matched, sa-gs": np.ones(len(RATES)),
     }
     for (name, share), colour in zip(shares.items(), COLOURS, strict=False):
-        axes.plot(RATES, share, marker="o", ms=4, color=colour, label=name)
-    axes.set(xlabel="rate r", ylabel="light against training's", title="Statement 2")
-    _labelled(axes, RATES, ink)
-
-
-def _merging(axes: Axes, ink: str) -> None:
+        light.plot(RATES, share, marker="o", ms=4, color=colour, label=name)
+    light.set(xlabel="rate r", ylabel="light against training's", title="Statement 2")
     errors = [error(cell) for cell in CELLS]
-    axes.plot(CELLS, errors, marker="o", ms=4, color=COLOURS[0], label="largest of 40 random cells")
-    axes.plot(CELLS, LARGEST_THIRD * CELLS**3 / 6, color=ink, ls=(0, (4, 3)), lw=1, label="a₃ (h/s)³ / 6")
-    axes.set(xlabel="cell h against filter s", ylabel="error of the light, over its peak", title="Statement 6")
-    _labelled(axes, CELLS, ink)
-
-
-def _labelled(axes: Axes, places: np.ndarray, ink: str) -> None:
-    axes.set(xscale="log", yscale="log")
-    axes.set_xticks(places, [scale_name(place) for place in places])
-    axes.minorticks_off()
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.grid(color=ink, alpha=0.12)
-    axes.legend()
+    merging.plot(CELLS, errors, marker="o", ms=4, color=COLOURS[0], label="largest of 40 random cells")
+    merging.plot(CELLS, LARGEST_THIRD * CELLS**3 / 6, color=ink, ls=(0, (4, 3)), lw=1, label="a₃ (h/s)³ / 6")
+    merging.set(xlabel="cell h against filter s", ylabel="error of the light, over its peak", title="Statement 6")
+    for axes, places in ((light, RATES), (merging, CELLS)):
+        axes.set(xscale="log", yscale="log")
+        axes.set_xticks(places, [scale_name(place) for place in places])
+        axes.minorticks_off()
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.grid(color=ink, alpha=0.12)
+        axes.legend()
+    return figure
 
 
 def error(cell: float) -> float:

@@ -36,32 +36,27 @@ def main(gaussians: Sequence[int] = (100_000, 550_000, 1_000_000), seconds: floa
     """Print the table; seconds: of a flight."""
     delays = ("pose to picture, ms", "95 %", "rest to full quality, s")
     heading("the live view", "Gaussians", "clients", "frames/s", *delays, "MB/s", "GB")
-    for count, clients in itertools.product(gaussians, (1, 2)):
-        fly_together(count, clients, seconds)
-
-
-def fly_together(gaussians: int, clients: int, seconds: float) -> None:
-    """Print one line of the table."""
     trained = synthetic_camera(*WINDOW).as_trained()
     view, cameras = replace(trained, trained_focal=None), CameraSet((trained,), (trained,))
-    with serving(synthetic_scene(gaussians), cameras, port=0, no_browser=True) as address:
-        Flight().fly(address, view, 2.0)  # warms up
-        flights = [Flight() for _ in range(clients)]
-        threads = [threading.Thread(target=flight.fly, args=(address, view, seconds)) for flight in flights]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    delays = sorted(1000 * delay for flight in flights for delay in flight.delays)
-    row(
-        f"{gaussians:,}",
-        clients,
-        " ".join(f"{len(flight.delays) / seconds:.1f}" for flight in flights),
-        *(f"{statistics.median(delays):.0f}", f"{delays[int(0.95 * len(delays))]:.0f}"),
-        " ".join(f"{flight.rest:.2f}" for flight in flights),
-        f"{sum(flight.bytes for flight in flights) / seconds / 1e6:.1f}",
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-    )
+    for count, clients in itertools.product(gaussians, (1, 2)):
+        with serving(synthetic_scene(count), cameras, port=0, no_browser=True) as address:
+            Flight().fly(address, view, 2.0)  # warms up
+            flights = [Flight() for _ in range(clients)]
+            threads = [threading.Thread(target=flight.fly, args=(address, view, seconds)) for flight in flights]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        delayed = sorted(1000 * delay for flight in flights for delay in flight.delays)
+        row(
+            f"{count:,}",
+            clients,
+            " ".join(f"{len(flight.delays) / seconds:.1f}" for flight in flights),
+            *(f"{statistics.median(delayed):.0f}", f"{delayed[int(0.95 * len(delayed))]:.0f}"),
+            " ".join(f"{flight.rest:.2f}" for flight in flights),
+            f"{sum(flight.bytes for flight in flights) / seconds / 1e6:.1f}",
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        )
 
 
 @dataclass
