@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -181,6 +182,19 @@ def made_by(words: str, dataset: Path, folder: Path) -> Path:
     with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
         main(words.split())
     return folder
+
+
+@pytest.fixture
+def stand_in(monkeypatch) -> Callable[..., ModuleType]:
+    """Makes modules by a name and what they hold."""
+
+    def module(name: str, **held: object) -> ModuleType:
+        made = ModuleType(name)
+        vars(made).update(held)
+        monkeypatch.setitem(sys.modules, name, made)
+        return made
+
+    return module
 
 
 _drawn: dict[str, bytes] = {}

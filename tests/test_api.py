@@ -29,20 +29,15 @@ def test_python_in_the_readme_gives_the_command_lines_image(cli):
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert found
     Path("readme.py").write_text(found[1])
-    image = runpy.run_path("readme.py")["image"]
-    words = "render scene.ply --cameras path/to/colmap --views r_8 -o one.png --scale 0.25"
-    cli.done(f"{words} --bit-depth 16")
-    aaplug.write_png("two.png", image, bit_depth=16)
-    assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
-    assert image[0, 0].min() == 1  # the chair's cameras say white
-
-
-def test_a_renderer_applies_the_recipes_world_filter(cli):
-    scene, cameras = aaplug.read_scene("scene.ply").gaussians(), aaplug.read_cameras(".")
-    image = aaplug.Renderer.of(scene, cameras, "mip-splatting")(cameras.test[0].scaled(0.5)).rgb
-    cli.done("render scene.ply --cameras . -o one.png --scale 0.5 --recipe mip-splatting --bit-depth 16")
-    aaplug.write_png("two.png", image, bit_depth=16)
-    assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
+    made = runpy.run_path("readme.py")
+    images, views = {"auto": made["image"]}, made["cameras"]
+    images["mip-splatting"] = aaplug.Renderer.of(made["scene"], views, "mip-splatting")(views.test[0].scaled(1 / 4)).rgb
+    words = "render scene.ply --cameras path/to/colmap --views r_8 --scale 0.25 --bit-depth 16 --overwrite -o one.png"
+    for recipe, image in images.items():  # one of which has a world filter
+        cli.done(f"{words} --recipe {recipe}")
+        aaplug.write_png("two.png", image, bit_depth=16, overwrite=True)
+        assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
+        assert image[0, 0].min() == 1  # the chair's cameras say white
 
 
 def test_the_default_device_of_a_program_changes_nothing(cli, monkeypatch):

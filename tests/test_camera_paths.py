@@ -17,10 +17,13 @@ VIEW = make_camera((0.0, -4.0, 0.0))
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def test_a_zoom_goes_from_start_to_end_and_back_in_octaves():
+def test_a_zoom_goes_from_start_to_end_and_back_in_octaves_in_frames_with_numbers():
     views = [paths.zoomed(VIEW, paths.factor(t, 1.0, 0.25)) for t in (0.0, 0.25, 0.5, 0.75)]
     assert [view.fx / VIEW.fx for view in views] == pytest.approx([1.0, 0.5, 0.25, 0.5])
     assert {view.hw for view in views} == {VIEW.hw}
+    frames = paths.frames(lambda t: paths.zoomed(VIEW, paths.factor(t, 1.0, 0.5)), 11)
+    assert [frame.name for frame in frames][:2] == ["00", "01"]
+    assert frames[1].fx == pytest.approx(frames[-1].fx)
 
 
 def test_a_dolly_moves_along_the_axis_and_keeps_the_focal_length():
@@ -52,12 +55,6 @@ def test_paths_keep_what_the_middle_shows_where_the_principal_point_is_far_off(l
 def test_up_is_what_is_up_in_the_images():
     views = (VIEW, make_camera((3.0, -1.0, 0.0)))
     assert paths.up_of(CameraSet(views, views)).tolist() == pytest.approx([0, 0, 1], abs=1e-9)
-
-
-def test_frames_are_named_by_number():
-    frames = paths.frames(lambda t: paths.zoomed(VIEW, paths.factor(t, 1.0, 0.5)), 11)
-    assert [frame.name for frame in frames][:2] == ["00", "01"]
-    assert frames[1].fx == pytest.approx(frames[-1].fx)  # there and back
 
 
 def document(**changes):

@@ -12,7 +12,7 @@ from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from threading import Lock, Thread
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -35,11 +35,10 @@ from tests.conftest import ALL_RASTERIZERS, ROOT, SAMPLE, files_of_at_most, run_
 from tests.work import refuse_three
 
 
-def test_what_a_notebook_defines_is_done_without_processes(monkeypatch):
+def test_what_a_notebook_defines_is_done_without_processes(stand_in):
     """No other process could import it."""
-    notebook = ModuleType("__main__")
+    notebook = stand_in("__main__")
     exec("import os\ndef where(item): return item, os.getpid()", vars(notebook))
-    monkeypatch.setitem(sys.modules, "__main__", notebook)
     assert [*Processes(2).map(notebook.where, range(3))] == [(item, os.getpid()) for item in range(3)]
 
 
@@ -52,11 +51,9 @@ def test_what_cannot_be_pickled_is_done_without_processes(held, tmp_path):
 
 
 @pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
-def test_results_come_in_order_until_the_first_error(executor, tmp_path, monkeypatch):
-    script = ModuleType("__main__")
-    script.__file__ = str(tmp_path / "without_guard.py")
-    Path(script.__file__).write_text("raise SystemExit")  # as it would run again in each process
-    monkeypatch.setitem(sys.modules, "__main__", script)
+def test_results_come_in_order_until_the_first_error(executor, tmp_path, stand_in):
+    (tmp_path / "without_guard.py").write_text("raise SystemExit")  # as it would run again in each process
+    stand_in("__main__", __file__=str(tmp_path / "without_guard.py"))
     results = []
     with pytest.raises(FormatError) as error:
         results.extend(executor.map(refuse_three, range(6)))

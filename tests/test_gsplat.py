@@ -753,19 +753,6 @@ def test_harmonics_equal_gsplats(reference, degree):
 
 
 @pytest.fixture
-def stand_in(monkeypatch) -> Callable[..., ModuleType]:
-    """Makes modules by a name and what they hold."""
-
-    def module(name: str, **held: object) -> ModuleType:
-        made = ModuleType(name)
-        vars(made).update(held)
-        monkeypatch.setitem(sys.modules, name, made)
-        return made
-
-    return module
-
-
-@pytest.fixture
 def homes(stand_in) -> dict[str, ModuleType]:
     """Modules of gsplat's names, as if it were installed, whose functions do nothing."""
     stand_in("gsplat", __path__=[], __version__="1.10.0")

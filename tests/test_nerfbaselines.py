@@ -2,7 +2,7 @@
 
 import sys
 from dataclasses import replace
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,11 +19,10 @@ EYES = [(0.3, -3.0, 0.4), (2.5, -1.0, -0.5), (-2.0, -2.0, 0.3)]
 
 
 @pytest.fixture
-def method(monkeypatch):
+def method(monkeypatch, stand_in):
     """The module, loaded beside nerfbaselines, or where that is missing beside what the module asks of it."""
     specs = []
-    monkeypatch.setitem(sys.modules, "nerfbaselines", ModuleType("nerfbaselines"))
-    monkeypatch.setattr(sys.modules["nerfbaselines"], "register", specs.append, raising=False)
+    stand_in("nerfbaselines", register=specs.append)
     monkeypatch.delitem(sys.modules, "aaplug.evaluation.nerfbaselines", raising=False)
     import aaplug.evaluation.nerfbaselines as module
 

@@ -17,7 +17,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from unittest.mock import Mock
 
@@ -141,18 +140,16 @@ def test_the_laws_run_over_what_the_plug_in_adds(finished):
     assert "failed" not in text
 
 
-def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(monkeypatch):
-    module = ModuleType("imports")
+def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(stand_in):
     odd = replace(METRICS["PSNR"], name="odd", measure=lambda image, truth: image)
-    vars(module).update(Colour=Colour, where=np.where, maximum=np.maximum, ODD=odd, measure=lambda image, truth: 0)
-    monkeypatch.setitem(sys.modules, "imports", module)
+    others = {"Colour": Colour, "where": np.where, "maximum": np.maximum, "measure": lambda image, truth: 0}
+    stand_in("imports", ODD=odd, **others)
     [verdict] = check_plugin("imports")
     assert (verdict.kind, verdict.name) == ("metric", "odd")
     assert verdict.problem.startswith("metric odd: gives no number but Tensor")
 
 
-def test_a_loss_that_an_entry_point_names_is_tried(monkeypatch):
-    module = ModuleType("losses")
+def test_a_loss_that_an_entry_point_names_is_tried(monkeypatch, stand_in):
     filters = torch.rand(4, 3, 32, 32)  # as a network has them: float32, and larger than some images
     losses = {
         "sum": lambda image, truth: (image - truth).square().sum(),
@@ -160,9 +157,8 @@ def test_a_loss_that_an_entry_point_names_is_tried(monkeypatch):
         "mean": lambda image, truth: image.mean(),
         "half": lambda image, truth: ((image - truth).detach() + image - truth).square().mean(),
     }
-    vars(module).update(losses)
+    stand_in("losses", **losses)
     points = [EntryPoint(name, f"losses:{name}", "aaplug.losses") for name in losses]
-    monkeypatch.setitem(sys.modules, "losses", module)
     monkeypatch.setattr("aaplug.verbs.check_plugin.entry_points", lambda group: points * (group == "aaplug.losses"))
     verdicts = {(name, law.partition(" ")[0]): problem for _, name, law, problem in check_plugin("losses")}
     assert len(verdicts) == 4 * 2
@@ -364,10 +360,8 @@ def test_a_plug_in_words_its_own_errors(monkeypatch, tmp_path):
         ("missing", "nothing", "cannot be imported: AttributeError"),
     ],
 )
-def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, monkeypatch):
-    module = ModuleType("left")
-    vars(module).update(Metric=Metric, odd=replace(METRICS["PSNR"], name="odd"))
-    monkeypatch.setitem(sys.modules, "left", module)
+def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, monkeypatch, stand_in):
+    stand_in("left", Metric=Metric, odd=replace(METRICS["PSNR"], name="odd"))
     metrics = Registry("metric", "aaplug.evaluation.metric:Metric", {"PSNR": METRICS["PSNR"]})
     monkeypatch.setattr("aaplug.evaluation.METRICS", metrics)
     point = EntryPoint(name, f"left:{object}", "aaplug.metrics")
@@ -379,10 +373,10 @@ def test_an_entry_point_that_is_left_out_is_a_broken_law(name, object, problem, 
     assert verdict.problem.startswith(problem)
 
 
-def test_an_entry_point_of_an_unknown_group_is_a_broken_law(monkeypatch):
+def test_an_entry_point_of_an_unknown_group_is_a_broken_law(monkeypatch, stand_in):
     odd = [EntryPoint("odd", "left:odd", "aaplug.metric"), EntryPoint("odd", "other:odd", "aaplug.odd")]
     usual = [point for group in entry_points().groups for point in entry_points(group=group)]
-    monkeypatch.setitem(sys.modules, "left", ModuleType("left"))
+    stand_in("left")
     monkeypatch.setattr("aaplug.system.registry._points", lambda: EntryPoints([*usual, *odd]))
     [verdict] = check_plugin("left")
     assert verdict[:3] == ("entry point", "odd", "Its entry point registers it.")
@@ -402,10 +396,8 @@ def test_an_import_that_ends_the_program_is_told(tmp_path, monkeypatch):
         check_plugin("ends_here")
 
 
-def test_a_broken_law_shows_where_it_raises(monkeypatch):
-    module = ModuleType("tests")
-    module.RAISES = replace(METRICS["PSNR"], name="odd", measure=fails)  # pyright: ignore[reportAttributeAccessIssue]
-    monkeypatch.setitem(sys.modules, "tests", module)
+def test_a_broken_law_shows_where_it_raises(stand_in):
+    stand_in("tests", RAISES=replace(METRICS["PSNR"], name="odd", measure=fails))
     [verdict] = check_plugin("tests")
     assert re.fullmatch(r"KeyError: 'key', in line \d+ of test_plugin.py", verdict.problem)
 
