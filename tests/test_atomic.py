@@ -18,6 +18,7 @@ from aaplug.io.atomic import check_output, claimed, output_folder, replacing, wr
 from aaplug.io.image_formats import Storage
 from aaplug.io.layers import write_layers
 from aaplug.io.scenes import write_scene
+from aaplug.io.video import write_video
 from aaplug.system import locks
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
@@ -103,16 +104,21 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_file(output: Path, call: str
     assert only_the_old_file_is_there(output)
 
 
-@pytest.mark.parametrize(
-    ("package", "name"), [("pxr", "a.usda"), ("pxr", "a.usdc"), ("pxr", "a.usdz"), ("OpenEXR", "a.exr")]
-)
-def test_a_full_disk_that_a_library_meets_is_one_line(tmp_path: Path, package: str, name: str):
+NOISE = torch.rand(20, 100, 100, 3)
+WRITERS = {
+    **dict.fromkeys(("a.usda", "a.usdc", "a.usdz"), ("pxr", lambda path: write_scene(path, make_scene(200)))),
+    "a.exr": ("OpenEXR", lambda path: write_layers(path, {"rgb": NOISE[0]}, Storage.of(path))),
+    **dict.fromkeys(("a.webm", "a.mp4"), ("av", lambda path: write_video(path, NOISE, 25.0))),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_that_a_library_meets_is_one_line(tmp_path: Path, name: str):
+    package, write = WRITERS[name]
     pytest.importorskip(package)
-    image = {"rgb": torch.rand(100, 100, 3)}
-    how = (write_scene, make_scene(200)) if package == "pxr" else (write_layers, image, Storage.of(Path(name)))
     said = rf"{name}: cannot be written: file too large$"
     with files_of_at_most(10_000), pytest.raises(OutputError, match=said):
-        how[0](tmp_path / name, *how[1:])
+        write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -38,7 +38,7 @@ from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.system.executors import torch_threads
 from aaplug.system.locks import SCRATCH_PREFIX
-from tests.conftest import COMPILED, make_camera, make_scene, run_python, sized
+from tests.conftest import COMPILED, exit_code, make_camera, make_scene, run_python, sized
 
 ANSWER = 1e-5
 CACHE = compiled.cache_folder()
@@ -273,12 +273,7 @@ def test_a_library_that_ended_a_process_is_left_aside(copied_cache, monkeypatch,
     mark = compiled.package_path(kernel).with_suffix(".so.sha256")
     with monkeypatch.context() as patch:
         patch.setattr(compiled, "_opened", lambda library: os._exit(9))
-        if not (child := os.fork()):
-            try:
-                compiled.package_of(kernel)
-            finally:
-                os._exit(0)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+        assert exit_code(lambda: compiled.package_of(kernel)) == 9
         assert compiled.package_of(kernel) is None
     said = f"a process that loaded it died; if it was killed, delete {mark}; images are drawn eagerly"
     assert said in caplog.text

@@ -469,11 +469,13 @@ def path(tmp_path):
     return journal.path
 
 
-def test_what_is_finished_comes_back_to_the_bit_and_zeros_of_a_lost_disk_do_not(path):
+def test_what_is_finished_comes_back_to_the_bit_and_to_one_process_and_zeros_of_a_lost_disk_do_not(path):
     whole = path.read_bytes()
     path.write_bytes(whole + b"\0" * 50 + b"\n")
     with Journal(path, REQUEST, resume=True) as journal:
         assert journal.views == {0: (measured("a"),), 1: (measured("b"),)}
+        with pytest.raises(UsageError, match="another process"):
+            Journal(path, REQUEST, resume=True)
     assert path.read_bytes() == whole
 
 
@@ -497,11 +499,6 @@ def test_another_request_is_refused_by_what_changed_until_the_journal_is_begun_a
     assert len(path.read_text().splitlines()) == 2
     path.unlink()
     assert not Journal(path, other, resume=True).views
-
-
-def test_two_processes_do_not_share_a_journal(path):
-    with Journal(path, REQUEST, resume=True), pytest.raises(UsageError, match="another process"):
-        Journal(path, REQUEST, resume=True)
 
 
 def test_nothing_is_made_before_the_first_view_and_a_place_that_cannot_be_written_is_named(tmp_path):
