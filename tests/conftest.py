@@ -290,6 +290,20 @@ def watched(browser) -> Iterator[Callable[..., Any]]:
     assert troubles == []
 
 
+def place(page: Any, x: float, y: float, on: str = "#picture") -> tuple[float, float]:
+    """A place on the screen, from shares of an element."""
+    box = page.locator(on).bounding_box()
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+
+def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button: str = "left", **on: str) -> None:
+    """Move the mouse with a button held down, from one place of an element to another."""
+    page.mouse.move(*place(page, *start, **on))
+    page.mouse.down(button=button)
+    page.mouse.move(*place(page, *end, **on), steps=4)
+    page.mouse.up(button=button)
+
+
 def click(box: Any) -> None:
     """Click a box of a page itself: a picture that arrives may move it away from under a mouse."""
     box.dispatch_event("click")

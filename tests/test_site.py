@@ -18,7 +18,7 @@ from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
 from tests.bench.theory import laws
 from tests.bench.viewers import shown_table
-from tests.conftest import ROOT
+from tests.conftest import ROOT, drag
 
 GUIDES = ROOT / "examples" / "guides"
 SITE = ROOT / "examples" / "site"
@@ -142,11 +142,7 @@ def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both
     gallery = watched(width=390, height=844)
     gallery.goto((tmp_path / "page.html").as_uri())
     gallery.wait_for_selector(".compare[data-split='0.500']")
-    box = gallery.locator(".stage canvas").bounding_box()
-    gallery.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
-    gallery.mouse.down()
-    gallery.mouse.move(box["x"] + box["width"] / 4, box["y"] + 50)
-    gallery.mouse.up()
+    drag(gallery, (0.5, 0.2), (0.25, 0.2), on=".stage canvas")
     gallery.wait_for_selector(".compare[data-split='0.250']")
     gallery.locator(".stage").press("]")
     gallery.wait_for_selector(".compare[data-split='0.270']")

@@ -17,7 +17,7 @@ from aaplug import Renderer, read_camera_path, read_image, serving, write_scene
 from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
-from tests.conftest import click, make_camera, make_scene
+from tests.conftest import click, drag, make_camera, make_scene, place
 from tests.test_view import decoded, with_photograph
 
 SEEN = "#picture"
@@ -132,19 +132,6 @@ def image(page, selector=SEEN) -> torch.Tensor:
 
 def groups_of_views(page) -> list[str]:
     return page.evaluate("[...document.querySelectorAll('#view optgroup')].map((group) => group.label)")
-
-
-def drag(page, start, end, button="left"):
-    page.mouse.move(*place(page, *start))
-    page.mouse.down(button=button)
-    page.mouse.move(*place(page, *end), steps=4)
-    page.mouse.up(button=button)
-
-
-def place(page, x, y) -> tuple[float, float]:
-    """A place on the screen, from shares of the picture."""
-    box = page.locator(SEEN).bounding_box()
-    return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
 def says(page, script: str):

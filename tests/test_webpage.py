@@ -24,7 +24,7 @@ from aaplug.evaluation.report import webpage
 from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size
 from aaplug.io.streamed import STREAMS
-from tests.conftest import click, make_camera, make_scene, with_photographs
+from tests.conftest import click, drag, make_camera, make_scene, with_photographs
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
 PICTURE = "#stage canvas"
@@ -176,12 +176,8 @@ def choose(page, *roles: str):
 
 def test_the_divider_works_by_mouse_and_by_keyboard(opened):
     page = opened()
-    box = page.locator(PICTURE).bounding_box()
     assert data(page, "split") == "0.500"
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * 0.2, box["y"] + box["height"] / 2)
-    page.mouse.up()
+    drag(page, (0.5, 0.5), (0.2, 0.5), on=PICTURE)
     wait(page, split="0.200")
     assert float(page.input_value("#split")) == pytest.approx(20, abs=1)
     page.focus("#split")
