@@ -39,25 +39,19 @@ from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene, with_photographs
 
+VIEWS = (make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b"))
+
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    """The scene's own look, and two views whose photographs are slightly brightened renders."""
-    views = [make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b")]
-    scene = make_scene(150)
-    look = own_look(scene, TrainingViews.of(scene, views), "eager")
-    recipe = replace(look, recipe=RECIPES["classic"])
-    return look, with_photographs(recipe, views, tmp_path_factory.mktemp("photos"), 0.9, 0.05).test
+def look():
+    return own_look(scene := make_scene(150), TrainingViews.of(scene, VIEWS), "eager")
 
 
-@pytest.fixture
-def look(world):
-    return world[0]
-
-
-@pytest.fixture
-def views(world):
-    return world[1]
+@pytest.fixture(scope="module")
+def views(look, tmp_path_factory):
+    """Their photographs are slightly brightened renders."""
+    classic = replace(look, recipe=RECIPES["classic"])
+    return with_photographs(classic, VIEWS, tmp_path_factory.mktemp("photos"), 0.9, 0.05).test
 
 
 def drawn(look, view, recipe="classic"):
