@@ -92,20 +92,13 @@ class Block(NamedTuple):
         return f"{self.document}-{self.number}-{self.language}"
 
 
-def blocks_of(path: Path) -> list[Block]:
-    found = re.finditer(r"(^<!-- .*-->\n)?^```(\w*)\n(.*?)^```$", path.read_text(), re.M | re.S)
-    return [
-        Block(path.stem, number, match[2], match[3])
-        for number, match in enumerate(found, 1)
-        if not (match[1] or "").startswith(RUN_BY_THE_GATE)
-    ]
-
-
+FENCED = re.compile(r"(^<!-- .*-->\n)?^```(\w*)\n(.*?)^```$", re.M | re.S)
 BLOCKS = [
-    block
+    Block(path.stem, number, match[2], match[3])
     for path in (ROOT / "README.md", *GUIDES)
     if path.stem != "contributing"  # test_plugin.py runs its blocks, with its plug-in installed
-    for block in blocks_of(path)
+    for number, match in enumerate(FENCED.finditer(path.read_text()), 1)
+    if not (match[1] or "").startswith(RUN_BY_THE_GATE)
 ]
 COMMANDS = [block for block in BLOCKS if block.language == "bash"]
 PROGRAMS = [block for block in BLOCKS if block.language == "python"]

@@ -66,16 +66,13 @@ def cameras() -> list[dict[str, Any]]:
         places.append(((4 * x, 4 * y, 1.5), (0.0, 0.0, -0.1), 70.0))
         if i % 2:
             places.append(((0.1 * x, 0.1 * y, 1.2), (5 * x, 5 * y, 3.0), 100.0))
-    return [_entry(number, *place) for number, place in enumerate(places)]
-
-
-def _entry(number: int, eye: tuple[float, ...], target: tuple[float, ...], degrees: float) -> dict[str, Any]:
-    """An entry of INRIA's cameras.json."""
-    pose = look_at(torch.tensor(eye).double(), torch.tensor(target).double(), UP)
-    rotation = pose[:3, :3].T
-    focal = SIDE / 2 / math.tan(math.radians(degrees) / 2)
-    names = {"id": number, "img_name": f"v{number}", "width": SIDE, "height": SIDE, "fx": focal, "fy": focal}
-    return names | {"position": (-rotation @ pose[:3, 3]).tolist(), "rotation": rotation.tolist()}
+    entries = []  # of INRIA's cameras.json
+    for number, (eye, target, degrees) in enumerate(places):
+        rotation = look_at(torch.tensor(eye).double(), torch.tensor(target).double(), UP)[:3, :3].T
+        focal = SIDE / 2 / math.tan(math.radians(degrees) / 2)
+        names = {"id": number, "img_name": f"v{number}", "width": SIDE, "height": SIDE, "fx": focal, "fy": focal}
+        entries.append(names | {"position": list(eye), "rotation": rotation.tolist()})
+    return entries
 
 
 def _measure(command: str, *args: str) -> None:
