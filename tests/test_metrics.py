@@ -51,10 +51,9 @@ def test_a_metrics_loss_is_least_at_its_ideal(metric):
 
 
 @pytest.fixture(scope="module")
-def comparing(tmp_path_factory):
+def comparing(weights):
     """Every metric that compares with a truth, by name; LPIPS with random weights."""
-    weights = lpips_weights(tmp_path_factory.mktemp("weights"))["vgg"]
-    return {metric.name: metric for metric in find_metrics(COMPARING, PROTOCOLS["default"], weights)}
+    return {metric.name: metric for metric in find_metrics(COMPARING, PROTOCOLS["default"], weights["vgg"])}
 
 
 LEAST_SIDES = {"SSIM": 11, "LPIPS": 32}  # px
@@ -105,14 +104,10 @@ def test_metrics_that_cannot_be_had_are_refused(names, words):
 CHANNELS = (4, 5, 6, 7, 8)
 
 
-@pytest.fixture
-def weights(tmp_path):
-    return lpips_weights(tmp_path)
-
-
-def lpips_weights(folder: Path) -> dict[str, tuple[Path, Path]]:
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> dict[str, tuple[Path, Path]]:
     """Files of random weights of few channels, in the layout of torchvision and of the lpips package, by net."""
-    files = {}
+    folder, files = tmp_path_factory.mktemp("weights"), {}
     for name, net in NETS.items():
         g = torch.Generator().manual_seed(3)
         trunk, before, size = {}, 3, {"vgg": 3, "alex": 3}[name]

@@ -26,6 +26,8 @@ from aaplug.io.photographs import photo_of
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.binning import bands
 from tests.bench import heading, row, timed
+from tests.bench.literature import photographs as photographs_of
+from tests.bench.literature import psnr
 from tests.bench.scenes import decibels, middle, middle_of, trained
 
 TIMED_SCALES = (1.0, 0.5, 0.25)
@@ -85,15 +87,11 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
         )
         row(kind, *shares, f"{popping:.5f}", close)
     heading(f"{scene}, whole views", "order", "PSNR, dB", *(f"ms at {scale:g}" for scale in TIMED_SCALES))
-    views = opened.views(whole)
-    close = {
-        order: mean(decibels(paint(v).rgb.clamp(0, 1), photo_of(v, background)(v)) for v in views)
-        for order, paint in orders.items()
-    }
+    truths = photographs_of(opened, (1.0,), opened.views(whole))
     works = {(order, s): partial(paint, view.scaled(s)) for order, paint in orders.items() for s in TIMED_SCALES}
     times = timed(works, TURNS)
     for order in orders:
-        row(order, close[order], *(1000 * times[order, scale] for scale in TIMED_SCALES))
+        row(order, *psnr(orders[order], truths), *(1000 * times[order, scale] for scale in TIMED_SCALES))
 
 
 def composited(
