@@ -126,11 +126,8 @@ def lcc(folder: Path) -> Path:
     tenth = torch.cat([((rest / 2**0.5 + 0.5) * 1023).round().long(), largest[:, None]], dim=1)
     channels = ((s.sh[:, 1:] / span + 1) / 2 * torch.tensor([2047, 1023, 2047])).round().long()
     rows = np.zeros(len(s), FAR_RECORD)
-    rows["means"], rows["rgba"], rows["scales"] = (
-        s.means,
-        rgba_bytes(s),
-        ((s.scales - low) / (high - low) * 65535).round(),
-    )
+    rows["means"], rows["rgba"] = s.means, rgba_bytes(s)
+    rows["scales"] = ((s.scales - low) / (high - low) * 65535).round()
     rows["quats"] = (tenth << torch.tensor([0, 10, 20, 30])).sum(dim=1)
     rows["sh"][:, :15] = (channels << torch.tensor([0, 11, 21])).sum(dim=2)
     near, index = rows[:-far], b""

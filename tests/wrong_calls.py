@@ -72,10 +72,8 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     verbs = ("convert", "evaluate", "finetune", "lod", "video")
     gsplat = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales, "width": 16, "height": 12}
     gsplat |= {"opacities": gaussians.opacities, "colors": gaussians.sh[:, 0]}
-    gsplat |= {
-        "viewmats": view.cam_from_world[None].float(),
-        "Ks": torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]]),
-    }
+    intrinsics = torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]])
+    gsplat |= {"viewmats": view.cam_from_world[None].float(), "Ks": intrinsics}
     functions = {
         **{name: {"scene": nowhere, "output": folder / name} for name in verbs},
         "refine_poses": {"scene": nowhere} | plain,
@@ -172,12 +170,8 @@ def odd_tensors(x: Tensor) -> list[Any]:
     """Further variations of a right tensor, each odd in one respect."""
     kinds = [x.to(dtype) for dtype in (torch.bfloat16, torch.int32, torch.float64, torch.bool)]
     shapes = [x[None], x[:0], x.expand(2, *x.shape), x.flatten(), x.reshape(-1, 1)]
-    return [
-        *kinds,
-        *shapes,
-        *(torch.full_like(x, n) for n in (math.nan, math.inf) if x.is_floating_point()),
-        x.tolist(),
-    ]
+    values = [torch.full_like(x, n) for n in (math.nan, math.inf) if x.is_floating_point()]
+    return [*kinds, *shapes, *values, x.tolist()]
 
 
 def empty_ones(noun: Any) -> list[Any]:
