@@ -197,12 +197,8 @@ def test_no_step_leaves_a_gaussian_thinner_than_its_bound():
 
 
 def test_densify_clones_the_small_splits_the_large_and_prunes_the_faint():
-    scene = make_scene(4)
-    scene = replace(
-        scene,
-        log_scales=torch.tensor([-6.0, -6.0, 0.0, 0.0])[:, None].repeat(1, 3),
-        logit_opacities=torch.tensor([1.0, -9.0, 1.0, 1.0]),
-    )
+    sizes, opacities = torch.tensor([-6.0, -6.0, 0.0, 0.0])[:, None].repeat(1, 3), torch.tensor([1.0, -9.0, 1.0, 1.0])
+    scene = replace(make_scene(4), log_scales=sizes, logit_opacities=opacities)
     pull = torch.tensor([2 * MIN_GRADIENT, 0.0, 2 * MIN_GRADIENT, 0.0])
     change = densify(scene, pull, 1.0, torch.Generator().manual_seed(0))
     assert change.sources.tolist() == [0, 3, 0, 2, 2]

@@ -460,12 +460,8 @@ def test_a_gsplat_export_is_what_the_cfg_of_its_run_says(tmp_path: Path, folder:
 @pytest.mark.parametrize("kind", ["binary", ">", "text", "double", "bytes", "filter", "disc"])
 def test_every_kind_of_ply_keeps_the_convention(tmp_path: Path, kind: str):
     """Antialiased is the one that needs both a viewer's tag and aaplug's own comment."""
-    file = {
-        "double": with_type("double", "x"),
-        "bytes": coloured(),
-        "filter": filtered(),
-        "disc": without("scale_2"),
-    }.get(kind, plain("hello"))
+    files = {"double": with_type("double", "x"), "bytes": coloured(), "filter": filtered(), "disc": without("scale_2")}
+    file = files.get(kind, plain("hello"))
     path = coded(tmp_path, file, kind) if kind in (">", "text") else file.save(tmp_path)
     through(replace(read_scene(path).gaussians(), convention=ANTIALIASED), tmp_path)
     again = read_scene(tmp_path / "out.ply").gaussians()
