@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from aaplug import RECIPES, Camera, Gaussians, Render, Renderer, Splats2D, TrainingViews, UsageError
+from aaplug.core.splats import concatenated
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, splats_of
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
-NAMES = ("means", "covs", "dets", "depths", "opacities", "sources", "rgb")
 SAME = 1e-6  # the order of a sum may change
 
 
@@ -24,10 +24,6 @@ def splats() -> Splats2D:
     splats = make_splats(150, HW, seed=1)
     order = torch.randperm(150, generator=torch.Generator().manual_seed(2))
     return replace(splats, depths=2 + order / 150)
-
-
-def joined(*parts: Splats2D) -> Splats2D:
-    return Splats2D(*(torch.cat([getattr(part, name) for part in parts]) for name in NAMES))
 
 
 def shuffled(splats: Splats2D, seed: int = 0) -> Splats2D:
@@ -50,11 +46,11 @@ def assert_same(image: Render, other: Render, atol: float = SAME) -> None:
 
 
 def test_splats_behind_an_opaque_wall_change_nothing(rasterize, splats):
-    wall = joined(*[one(covariance=(1e8, 0.0, 1e8), opacity=1.0)] * 3)
-    before = rasterize(joined(wall, splats), HW, SKY)
+    wall = concatenated([one(covariance=(1e8, 0.0, 1e8), opacity=1.0)] * 3)
+    before = rasterize(concatenated([wall, splats]), HW, SKY)
     hidden = make_splats(100, HW, seed=7)
     hidden = replace(hidden, depths=hidden.depths + 1.5, rgb=hidden.rgb * 100)
-    assert_same(rasterize(shuffled(joined(wall, splats, hidden)), HW, SKY), before)
+    assert_same(rasterize(shuffled(concatenated([wall, splats, hidden])), HW, SKY), before)
     assert_same(rasterize(wall, HW, SKY), before)
 
 
@@ -84,7 +80,7 @@ UNSEEN |= {f"opacity {opacity:g}": faint(opacity) for opacity in (0.0, 1e-40, 1e
 
 @pytest.mark.parametrize("unseen", UNSEEN)
 def test_splats_that_cannot_be_seen_change_nothing(rasterize, splats, unseen):
-    assert_same(rasterize(shuffled(joined(UNSEEN[unseen], splats)), HW, SKY), rasterize(splats, HW, SKY))
+    assert_same(rasterize(shuffled(concatenated([UNSEEN[unseen], splats])), HW, SKY), rasterize(splats, HW, SKY))
 
 
 POISON = {
@@ -108,7 +104,7 @@ POISON = {
 @pytest.mark.parametrize("poison", POISON)
 def test_extreme_splats_give_finite_images(rasterize, splats, poison):
     alone = rasterize(POISON[poison], HW, SKY)
-    together = rasterize(joined(splats, POISON[poison]), HW, SKY)
+    together = rasterize(concatenated([splats, POISON[poison]]), HW, SKY)
     for image in (alone, together):
         assert image.rgb.isfinite().all()
         assert image.alpha.isfinite().all()
