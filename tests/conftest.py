@@ -382,6 +382,11 @@ def assert_equal(a: Gaussians, b: Gaussians) -> None:
         assert torch.equal(column, b.columns[name]), name
 
 
+def shuffled(noun: Any, seed: int = 0) -> Any:
+    """Its Gaussians, or splats, in another order."""
+    return noun[torch.randperm(len(noun), generator=torch.Generator().manual_seed(seed))]
+
+
 def moved(camera: Camera, offset: Iterable[float]) -> Camera:
     """The camera moved by an offset in the world."""
     pose = camera.cam_from_world.clone()

@@ -1,6 +1,5 @@
 """Camera paths, and reading nerfstudio's."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from aaplug.core import camera_paths as paths
 from aaplug.core.lenses import PINHOLE, Lens
 from aaplug.io.cameras.camera_path import sniff
 from tests.conftest import make_camera
+from tests.scene_files import write_json
 
 VIEW = make_camera((0.0, -4.0, 0.0))
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -65,8 +65,7 @@ def document(**changes):
 
 
 def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
-    file = tmp_path / "camera_path.json"
-    file.write_text(json.dumps(document()))
+    file = write_json(tmp_path / "camera_path.json", document())
     assert sniff(file)
     path = read_camera_path(file)
     (camera,) = path.cameras
@@ -98,7 +97,5 @@ for wrong in ({"radius": 0, "focus": 3}, {"radius": 1}, {"radius": 1, "focus": 1
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_camera_path_is_refused_by_its_field(tmp_path, case):
     content, named = BROKEN[case]
-    file = tmp_path / "camera_path.json"
-    file.write_text(json.dumps(content))
     with pytest.raises(FormatError, match=named):
-        read_camera_path(file)
+        read_camera_path(write_json(tmp_path / "camera_path.json", content))

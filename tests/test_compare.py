@@ -22,7 +22,7 @@ from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_sheet, error_map, side_by_side
 from aaplug.io.images import image_size
 from aaplug.system.executors import load, save
-from tests.conftest import EYES, make_scene
+from tests.conftest import EYES, make_scene, shuffled
 from tests.scene_files import DATA, half_turn_about_x
 from tests.test_batch import killed_at
 
@@ -47,10 +47,6 @@ def lopsided():
 def carried(scene, turn, scale=1.0, shift=(0.0, 0.0, 0.0)):
     means = scale * scene.means @ torch.tensor(turn, dtype=torch.float32).T + torch.tensor(shift)
     return replace(scene, means=means)
-
-
-def shuffled(scene, seed=0):
-    return scene[torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))]
 
 
 def test_a_scene_equals_itself_at_every_scale(cli):

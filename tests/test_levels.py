@@ -27,7 +27,7 @@ from aaplug.methods.conversion import MERGED, blurring
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
-from tests.conftest import assert_equal, make_camera, make_scene
+from tests.conftest import assert_equal, make_camera, make_scene, shuffled
 
 RATE = 20.0  # px per world unit
 
@@ -136,8 +136,7 @@ def test_equal_gaussians_are_merged_too():
 
 def test_the_order_of_the_scene_plays_no_part():
     scene = make_scene(300)
-    shuffled = scene[torch.randperm(300, generator=torch.Generator().manual_seed(1))]
-    assert_equal(*(merged_to(60, s) for s in (scene, shuffled)))
+    assert_equal(*(merged_to(60, s) for s in (scene, shuffled(scene, 1))))
 
 
 def test_the_number_of_threads_plays_no_part(sample_scene):
@@ -177,8 +176,7 @@ def test_what_is_large_stays_and_what_is_small_is_merged():
     large.sh[:, 0] += torch.linspace(-2, 2, 50)[:, None]
     small.means[:] = 0.02 * small.means + 3
     small.log_scales[:] = math.log(0.002)
-    scene = Gaussians(*(torch.cat([getattr(s, n) for s in (large, small)]) for n in large.columns))
-    found = merge(scene, torch.full((450,), RATE), level_goal(1)).scene
+    found = merge(joined([large, small]), torch.full((450,), RATE), level_goal(1)).scene
     near = found.means.min(dim=1).values > 2
     assert int((~near).sum()) > 45
     assert int(near.sum()) < 40

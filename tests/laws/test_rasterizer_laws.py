@@ -11,7 +11,7 @@ import torch
 
 from aaplug import RECIPES, Camera, Gaussians, Render, Renderer, Splats2D, TrainingViews, UsageError
 from aaplug.core.splats import concatenated
-from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, splats_of
+from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, shuffled, splats_of
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
@@ -24,10 +24,6 @@ def splats() -> Splats2D:
     splats = make_splats(150, HW, seed=1)
     order = torch.randperm(150, generator=torch.Generator().manual_seed(2))
     return replace(splats, depths=2 + order / 150)
-
-
-def shuffled(splats: Splats2D, seed: int = 0) -> Splats2D:
-    return splats[torch.randperm(len(splats), generator=torch.Generator().manual_seed(seed))]
 
 
 def one(
