@@ -444,8 +444,7 @@ def test_any_number_of_channels_is_composited_as_three_are():
         features = more.clone().requires_grad_()
         image = draw(replace(splats, rgb=features), HW, SKY, POINT)
         images.append((image.rgb, image.alpha, *torch.autograd.grad(image.rgb.square().sum(), features)))
-    for tiled, exact in zip(*images, strict=True):
-        torch.testing.assert_close(tiled, exact, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(*images, rtol=1e-9, atol=1e-9)
     assert images[0][0].shape == (*HW, 5)
     torch.testing.assert_close(images[1][0][..., :3], usual(POINT).rgb)
 
