@@ -374,8 +374,8 @@ def test_chosen_splats_are_those_of_the_rows_in_order_and_pass_gradients_on(rows
     splats = make_splats(9, (20, 20), 3, (0.0, 1.0)).to(F64)
     splats = replace(splats, depth_slopes=torch.ones(9, 2, dtype=F64), means=splats.means.requires_grad_())
     index = torch.tensor(rows, dtype=torch.long)
-    found = splats.selected(index)
-    for choice, part in ((index, found), (index.repeat(2), splats[index.repeat(2)]), (slice(2, 5), splats[2:5])):
+    found, mask = splats.selected(index), torch.zeros(9, dtype=torch.bool).index_fill(0, index, True)
+    for choice, part in ((index, found), *((at, splats[at]) for at in (index.repeat(2), slice(2, 5), mask))):
         for name, column in splats._columns().items():
             assert getattr(part, name).equal(column[choice]), name
     (grad,) = torch.autograd.grad(found.means.sum() + 0 * splats.means.sum(), splats.means)

@@ -22,10 +22,10 @@ FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
 MEMORY_LIMIT = 35e6  # bytes
 
 
-def ring(n: int = 7, focal_step: float = 0.2) -> list[Camera]:
+def ring() -> list[Camera]:
     """Cameras around the origin, each of another focal length; one with pixels that are not square."""
-    eyes = [(4 * math.cos(a), 3 * math.sin(a), 1.5 * math.sin(3 * a)) for a in range(n)]
-    cameras = [make_camera(eye, fov=0.4 + focal_step * (i % 4)) for i, eye in enumerate(eyes)]
+    eyes = [(4 * math.cos(a), 3 * math.sin(a), 1.5 * math.sin(3 * a)) for a in range(7)]
+    cameras = [make_camera(eye, fov=0.4 + 0.2 * (i % 4)) for i, eye in enumerate(eyes)]
     return [replace(cameras[0], fy=cameras[0].fy * 1.3), *cameras[1:]]
 
 
@@ -198,11 +198,11 @@ def test_memory_does_not_grow_with_gaussians_times_cameras():
     assert taken < MEMORY_LIMIT
 
 
-def at_bound(multiple: float, n: int = 10):
-    """Round Gaussians at the origin whose extent is that multiple of their bound."""
+def at_bound(multiple: float):
+    """Ten round Gaussians at the origin whose extent is that multiple of their bound."""
     view = make_camera((0.0, -4.0, 0.0))
     sigma = multiple * 0.2**0.5 / (view.focal / 4.0)
-    scene = replace(make_scene(n), means=torch.zeros(n, 3), log_scales=torch.full((n, 3), sigma).log())
+    scene = replace(make_scene(10), means=torch.zeros(10, 3), log_scales=torch.full((10, 3), sigma).log())
     return scene, TrainingViews.of(scene, [view])
 
 
