@@ -18,20 +18,20 @@ VIEWS = 12
 PALE = 0.3  # colour of the furnished room's walls against those of the bare one
 
 
-def room(per_side: int = 300, side: float = SIDE) -> Gaussians:
+def room(per_side: int = 300) -> Gaussians:
     """Six walls of `per_side`² Gaussians each, half a step wide, with waves of colour on each.
 
     Neighbours are alike: their order, by depth in a pinhole and by distance in a panorama, is not what is tested.
     """
-    step = side / per_side
-    line = (torch.arange(per_side, dtype=torch.float64) + 0.5) * step - side / 2
+    step = SIDE / per_side
+    line = (torch.arange(per_side, dtype=torch.float64) + 0.5) * step - SIDE / 2
     a, b = (x.flatten() for x in torch.meshgrid(line, line, indexing="ij"))
     means, scales, colours = [], [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             others = [i for i in range(3) if i != axis]
             place = torch.empty(len(a), 3, dtype=torch.float64)
-            place[:, axis], place[:, others[0]], place[:, others[1]] = sign * side / 2, a, b
+            place[:, axis], place[:, others[0]], place[:, others[1]] = sign * SIDE / 2, a, b
             size = torch.full((len(a), 3), 0.5 * step, dtype=torch.float64)
             size[:, axis] *= FLATNESS
             waves = [(f * a + g * b + axis + sign).sin() for f, g in ((4, 1), (1, 3), (2, -2))]
@@ -50,12 +50,12 @@ def room(per_side: int = 300, side: float = SIDE) -> Gaussians:
     )
 
 
-def inside(side: float = SIDE, focal: float = FOCAL) -> CameraSet:
+def inside(focal: float = FOCAL) -> CameraSet:
     """Training views from near the middle of the room, all around."""
     views = []
     for i in range(VIEWS):
         angle, height = 2 * math.pi * i / VIEWS, (-0.5, 0.0, 0.5)[i % 3]
-        eye = torch.tensor([0.05 * side * math.cos(angle), 0.05 * side * math.sin(angle), 0.0], dtype=torch.float64)
+        eye = torch.tensor([0.05 * SIDE * math.cos(angle), 0.05 * SIDE * math.sin(angle), 0.0], dtype=torch.float64)
         ahead = torch.tensor([math.cos(angle), math.sin(angle), height], dtype=torch.float64)
         pose = look_at(eye, eye + ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         size = round(2 * focal)
@@ -75,10 +75,10 @@ def turned(pose: Float[Tensor, "4 4"], right: float, up: float = 0.0) -> Float[T
     return turn @ pose
 
 
-def furnished(chair: Gaussians, side: float = SIDE) -> Gaussians:
+def furnished(chair: Gaussians) -> Gaussians:
     """The room with the bundled chair on its floor."""
-    walls = room(200, side)
+    walls = room(200)
     colour = torch.cat([walls.sh, walls.sh.new_zeros(len(walls), chair.sh.shape[1] - 1, 3)], dim=1)
-    drop = chair.means.new_tensor([0.0, 0.0, -side / 2 - float(chair.means[:, 2].quantile(0.001))])
+    drop = chair.means.new_tensor([0.0, 0.0, -SIDE / 2 - float(chair.means[:, 2].quantile(0.001))])
     chair = replace(chair, means=chair.means + drop, origin=None, extras={})
     return joined([chair, replace(walls, sh=PALE * colour)])
