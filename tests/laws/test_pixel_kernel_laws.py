@@ -46,43 +46,27 @@ def test_bounding_ellipses_contain_every_pixel_that_is_drawn_of_discs_at_their_h
     require_bounds(pixel, disc_splats(discs(100)), rules)
 
 
-def gaussians_at(offsets: Tensor, splats: Splats2D) -> Tensor:
-    """exp(-dᵀ C⁻¹ d / 2) at offsets (..., c, 2), by the inverse of the matrix."""
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    inverse = torch.linalg.inv(torch.stack([xx, xy, xy, yy], dim=1).unflatten(1, (2, 2)))
-    return (-0.5 * torch.einsum("...ci,cij,...cj->...c", offsets, inverse, offsets)).exp()
-
-
-def quadrature(splats: Splats2D, offsets: Tensor, turned: bool, points: int = 40) -> Tensor:
-    """Mean of each Gaussian over a square of side `window` by Gauss-Legendre; `turned` to the eigenvectors."""
-    nodes, weights = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(points))
+def quadrature(splats: Splats2D, offsets: Tensor) -> Tensor:
+    """Mean of each Gaussian over a square of side `window`, turned to its eigenvectors, by Gauss-Legendre."""
+    nodes, weights = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(40))
     square = 0.5 * splats.window * torch.cartesian_prod(nodes, nodes)
-    weight = (weights[:, None] * weights / 4).flatten()
-    axes = torch.eye(2, dtype=F64).expand(len(splats), 2, 2)
-    if turned:
-        xx, xy, yy = splats.covs.unbind(dim=1)
-        axes = torch.linalg.eigh(torch.stack([xx, xy, xy, yy], dim=1).unflatten(1, (2, 2)))[1]
-    inside = torch.einsum("cij,qj->qci", axes, square)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    covs = torch.stack([xx, xy, xy, yy], dim=1).unflatten(1, (2, 2))
+    inverses, inside = torch.linalg.inv(covs), torch.einsum("cij,qj->qci", torch.linalg.eigh(covs)[1], square)
     total = torch.zeros_like(offsets[..., 0])
-    for step, share in zip(inside, weight, strict=True):
-        total = total + share * gaussians_at(offsets + step, splats)
+    for step, share in zip(inside, (weights[:, None] * weights / 4).flatten(), strict=True):
+        at = offsets + step
+        total = total + share * (-0.5 * torch.einsum("...ci,cij,...cj->...c", at, inverses, at)).exp()
     return total
 
 
-@pytest.fixture
-def places() -> tuple[Splats2D, Tensor]:
-    """Splats, and offsets of pixels within four standard deviations and two pixels of them."""
-    splats = some_splats(60, (48, 64), (-1.2, 1.5))
-    g = torch.Generator().manual_seed(5)
-    spread = 2 * splats.covs[:, [0, 2]].sqrt() + 1
-    return splats, (2 * torch.rand(12, 60, 2, generator=g, dtype=F64) - 1) * spread
-
-
 @pytest.mark.parametrize("window", [0.3, 1.0])
-def test_the_integral_kernel_is_the_mean_over_the_turned_window(places, window):
-    splats, offsets = replace(places[0], window=window), places[1]
-    expected = quadrature(splats, offsets, turned=True)
-    torch.testing.assert_close(INTEGRAL.exact(splats, offsets), expected, rtol=1e-9, atol=1e-12)
+def test_the_integral_kernel_is_the_mean_over_the_turned_window(window):
+    """At pixels within four standard deviations and two pixels of each splat."""
+    splats = replace(some_splats(60, (48, 64), (-1.2, 1.5)), window=window)
+    places = 2 * torch.rand(12, 60, 2, generator=torch.Generator().manual_seed(5), dtype=F64) - 1
+    offsets = places * (2 * splats.covs[:, [0, 2]].sqrt() + 1)
+    torch.testing.assert_close(INTEGRAL.exact(splats, offsets), quadrature(splats, offsets), rtol=1e-9, atol=1e-12)
 
 
 def on_disc(scene: Gaussians, sources: Tensor, camera: Camera) -> Callable[[Tensor], Tensor]:
