@@ -26,6 +26,7 @@ import aaplug
 from aaplug import RECIPES, Renderer, TrainingViews, UsageError
 from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.lenses import EQUIDISTANT, PINHOLE
 from aaplug.core.projection import project
 from aaplug.gsplat.drawing import OnlyCompiled
 from aaplug.methods.pixel_kernels import point
@@ -440,9 +441,10 @@ def test_compiled_images_are_the_eager_ones(built, recipe, degree):
     assert difference.max() < 0.02
 
 
-def test_compiled_passes_by_order_are_the_eager_ones(built):
-    scene, camera = sized(make_scene(400)), make_camera(size=(150, 110))
-    assert built.ready(order.pass_kernel(POINT))
+@pytest.mark.parametrize(("lens", "pixel"), [(PINHOLE, POINT), (EQUIDISTANT, RAY)])
+def test_compiled_passes_by_order_are_the_eager_ones(built, lens, pixel):
+    scene, camera = sized(make_scene(400)), replace(make_camera(size=(150, 110)), lens=lens)
+    assert built.ready(order.pass_kernel(pixel))
     names = ["id", "depth-median", "depth-nearest", "samples"]
     fast, eager = (Renderer.of(scene, [camera], rasterizer=Tiled(k)).passes(camera, names) for k in (built, EAGER))
     for name in names:
@@ -505,7 +507,8 @@ def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
     return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
 
 
-PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray", "order-point"}
+ORDER = {"order-point", "order-ray"}
+PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray"} | ORDER
 EVERY = {kernel.name for kernel in compiled.KERNELS}
 
 
@@ -586,6 +589,7 @@ SECONDS = {  # to compile, measured; the others take 7 to 15
     "composite-point-kept": 63,
     "project-backward": 38,
     "order-point": 30,
+    "order-ray": 30,
     "composite-point-backward": 27,
     **{f"shade-{n}-gradients": t for n, t in ((4, 11), (9, 21), (16, 23))},
 }
