@@ -16,6 +16,7 @@ import torch
 import aaplug
 from aaplug import SH_C0, VIEWERS
 from aaplug.core.camera_paths import up_of
+from aaplug.core.conventions import ANTIALIASED
 from aaplug.core.orbits import frame_of
 from aaplug.core.sampling import median_rates
 from aaplug.io import rad, streamed
@@ -136,7 +137,8 @@ def read_rad(path):
 
     def headed(at):
         (length,) = struct.unpack_from("<I", data, at + 4)
-        return data[at : at + 4], json.loads(data[at + 8 : at + 8 + length]), at + 8 + -(-length // 8) * 8
+        header = json.loads(data[at + 8 : at + 8 + length], parse_constant=pytest.fail)
+        return data[at : at + 4], header, at + 8 + -(-length // 8) * 8
 
     def values(about, packed, count):
         raw = np.frombuffer(zlib.decompress(packed, -15), np.uint8)
@@ -314,9 +316,10 @@ def test_spark_draws_a_small_gaussian_below_large_ones():
 
 FAINT = replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20)
 LARGE = replace(make_scene(200, degree=4), log_scales=SCENE.log_scales + 3)
+FLAT = replace(LARGE, log_scales=LARGE.log_scales + torch.tensor([0.0, 0.0, -math.inf]), convention=ANTIALIASED)
 
 
-@pytest.mark.parametrize("scene", [FAINT, LARGE, SCENE.to(torch.float64), LARGE[:1]], ids=range(4))
+@pytest.mark.parametrize("scene", [FAINT, LARGE, SCENE.to(torch.float64), LARGE[:1], FLAT], ids=range(5))
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
     for tuning in {}, {"refine": True, "steps": 1, "overwrite": True}:
         levels = made(tmp_path, "rad", scene, **tuning)
