@@ -151,7 +151,7 @@ def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refu
             if name not in names:
                 raise FormatError(path, f"{where}: {name} is no setting here{did_you_mean(name, names)}")
             is_switch = options[name].count == 0 and isinstance(value, bool)
-            texts = [*map(str, value if isinstance(value, list) else [value])]
+            texts = [*map(str, value if isinstance(value, list) and options[name].count != 0 else [value])]
             values[name] = value if is_switch else options[name].value(texts)
         return words.where(**values).checked()
     except UsageError as error:

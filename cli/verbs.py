@@ -437,6 +437,8 @@ def bench(words: Words) -> Answer:
     To measure how close images come to the truth, use evaluate; to compile the fast rasterizer, warmup.
     """
     scene, cameras = read_inputs(words) if words.scene or words.model_path else (None, None)
+    if scene is None and words.cameras:
+        raise UsageError("--cameras", "belongs to a scene; name one, too")
     runs, exponents = aaplug.bench(scene, cameras, **told(words, verbs.BenchOptions))
     from aaplug.system.executors import given_threads
 

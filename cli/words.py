@@ -8,12 +8,12 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import cached_property
 from io import StringIO
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from aaplug.options.base import PYTHON_ONLY, SWITCH, Group, Option, Options, as_path, flag, options_of
+from aaplug.options.base import PYTHON_ONLY, SWITCH, Group, Option, Options, as_path, docs_of, flag, options_of
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, within_memory
 
 # a word that names a file, unlike names and numbers such as 1/4
@@ -133,8 +133,10 @@ class Command:
         """All options by name; they are read from the dataclasses when the verb is used."""
         options: dict[str, Option] = {}
         for each in self.stated:
-            for option in [each] if isinstance(each, Option) else options_of(each):
+            stated = [each] if isinstance(each, Option) else options_of(each)
+            for option in stated:
                 if option.group != PYTHON_ONLY:
+                    option = option if isinstance(each, Option) else replace(option, help=docs_of(each)[option.name])
                     options.setdefault(option.name, option)
         return options
 

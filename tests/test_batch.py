@@ -152,6 +152,7 @@ REFUSED = [
     (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
     (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
     ("min-seen = 2" + SETTINGS, "at the top: --min-seen: takes 0..1, got 2"),
+    (SETTINGS + "report = []", "--report: takes no value, got []"),
     (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
     (SETTINGS + "truth = 'other'", "--truth: 'other' is not one of auto"),
 ]

@@ -51,6 +51,10 @@ def test_the_exponent_of_a_power_is_found(power):
 BENCH = "bench --rasterizer eager --repeats 1 --resolution 40x24"
 
 
+def test_cameras_without_a_scene_are_refused(program):
+    program.refused("bench --cameras .", "--cameras: belongs to a scene; name one, too")
+
+
 def test_one_run_is_one_object_also_on_windows(program, monkeypatch):
     monkeypatch.setitem(sys.modules, "resource", None)
     figures = program.facts(f"{BENCH} --gaussians 300")

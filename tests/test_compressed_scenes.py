@@ -179,7 +179,7 @@ def test_files_of_an_index_have_a_limit_in_all_before_the_next_is_unpacked(tmp_p
     assert len(opened) == 6 + 3
 
 
-WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat) and find_spec(getattr(f, "needs", "aaplug"))]
+WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat) and find_spec(getattr(f, "needs", None) or "aaplug")]
 
 
 # largest errors of what is written: position, log-scale, opacity, colour (harmonic of degree 0), harmonics, and how far

@@ -347,10 +347,16 @@ def in_manifest(**changes):
     return change
 
 
+def edit_middle(level: Path) -> None:
+    data = bytearray(level.read_bytes())
+    data[len(data) // 2] ^= 1
+    level.write_bytes(data)
+
+
 BROKEN = {
     "missing": (lambda level, _: level.unlink(), "scene_lod1.ply: is missing"),
     "truncated": (lambda level, _: level.write_bytes(level.read_bytes()[:-7]), "scene_lod1.ply: is not the level"),
-    "edited": (lambda level, _: level.write_bytes(level.read_bytes()[:-1] + b"!"), "scene_lod1.ply: is not the level"),
+    "edited": (lambda level, _: edit_middle(level), "scene_lod1.ply: is not the level"),
     "foreign": (lambda level, _: level.with_name("scene_lod2.ply").replace(level), "scene_lod1.ply: is not the level"),
     "newer": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 3}'), "should be version 2, not version 3"),
     "older": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 1}'), "lod --overwrite` makes the levels"),

@@ -88,7 +88,7 @@ def test_white_stays_white_and_gray_gray(tmp_path, suffix):
     assert black.max() <= 1
 
 
-@pytest.mark.parametrize(("height", "width"), [(400, 600), (240, 320)])
+@pytest.mark.parametrize(("height", "width"), [(400, 600), (240, 320), (200, 300)])
 def test_what_becomes_small_is_also_shown_enlarged(height, width):
     image = torch.ones(height, width, 3)
     y, x = (slice(side // 2 - 10, side // 2 + 10) for side in (height, width))
@@ -106,6 +106,8 @@ def test_what_becomes_small_is_also_shown_enlarged(height, width):
             assert torch.allclose(pane[y, x], image[y, x], atol=0.5 / 255)
     near = side_by_side([image, image], ["a", "b"], 1.0)
     assert torch.allclose(near[40:, :width], image[40:], atol=0.5 / 255)
+    third = slice(height // 3 + 1, 2 * height // 3), slice(width // 3 + 1, 2 * width // 3)
+    assert torch.allclose(side_by_side([image, image], ["a", "b"], 1 / 3)[third], image[third], atol=0.5 / 255)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "equirect"])

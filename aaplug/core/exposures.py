@@ -57,7 +57,7 @@ def spread_out(
 ) -> tuple[Splats2D, Float[Tensor, " m"]]:
     """Splats convolved with their path across a sample's cell, less some faint ones; and the opacities of all of them.
 
-    light: factors of opacity for splats that are spread without end, None for 1; see `rendering.light`.  For one that
+    light: factors of opacity for splats that are spread without end, None for 1; see `core.light`.  For one that
         keeps the share r of its height it is light^(1 - r).
     """
     wide = splats.convolved(CELL_SHARE * cells(splats, camera), compensate=True, floor=0.0)

@@ -227,16 +227,16 @@ def docs_of(options: type) -> dict[str, str]:
 
 @cache
 def options_of(options: type[Options]) -> tuple[Option, ...]:
-    """The options of a class: what a field's annotation states, its docstring as help and its default.
+    """The options of a class: what a field's annotation states, and its default; `docs_of` has their help.
 
     A field of a Literal takes one of its values, and one whose annotation states nothing is a switch.
     """
-    hints, docs, found = get_type_hints(options, include_extras=True), docs_of(options), list[Option]()
+    hints, found = get_type_hints(options, include_extras=True), list[Option]()
     for each in fields(options):
         parts = getattr(hints[each.name], "__metadata__", ())
         kind = get_args(hints[each.name])[0] if parts else hints[each.name]
         usual = names(*get_args(kind)) if get_origin(kind) is Literal else SWITCH
         option = next((part for part in parts if isinstance(part, Option)), usual)
         group = next((part for part in parts if isinstance(part, Group)), None)
-        found.append(option.named(each.name, docs.get(each.name, ""), default=each.default, group=group))
+        found.append(replace(option, name=each.name, default=each.default, group=group))
     return tuple(found)

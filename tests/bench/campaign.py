@@ -89,7 +89,7 @@ def scenes() -> dict[str, Target]:
     )
     targets["scene scene.lcc, its index"] = index
     for format in SCENE_FORMATS.values():
-        if isinstance(format, WritableFormat) and find_spec(getattr(format, "needs", "aaplug")):
+        if isinstance(format, WritableFormat) and find_spec(getattr(format, "needs", None) or "aaplug"):
             targets.setdefault(f"scene of {format.name}", Target(_written(format.name), read_as_info_does))
     return targets
 

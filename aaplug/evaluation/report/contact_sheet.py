@@ -27,7 +27,7 @@ HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
 LIGHT_INK = (245, 245, 245)
 FRAME, FRAME_INK = 2, (128, 128, 128)  # px: edge of an inset
-MIN_INSET = 64  # px
+MIN_ROOM = 2 * HEADING  # px: above what is enlarged, for its own two lines of text
 ERROR_FULL = 32  # levels of 255 at the end of the error scale, as on the report's page
 HEAT = ((0, 0, 4), (86, 16, 110), (187, 55, 84), (249, 140, 10), (252, 255, 164))  # colours of the error scale
 BYTE = 255
@@ -99,7 +99,7 @@ def side_by_side(
 
     rate: size of things against the data set's view.  Where it falls, the middle is also shown enlarged in the bottom
         right corner, each pixel as a sharp square.  The inset stays outside of these things, and shows half of them
-        along each side, or a little more; without room for `MIN_INSET` px there is none.
+        along each side, or a little more; without `MIN_ROOM` px around them there is none.
     sampling: the images' sampling rate relative to training, which stands below the label then.
     """
     if len(images) == 1:
@@ -110,7 +110,7 @@ def side_by_side(
         height, width, _ = pixels.shape
         room = int((1 - part) / 2 * min(height, width)) - FRAME
         times = int((1 - part) / part)
-        if times > 1 and room >= MIN_INSET:
+        if times > 1 and room >= MIN_ROOM:
             side = room // times
             top, left = (height - side) // 2, (width - side) // 2
             inset = pixels[top : top + side, left : left + side].repeat(times, axis=0).repeat(times, axis=1)
