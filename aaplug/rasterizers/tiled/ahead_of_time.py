@@ -67,7 +67,6 @@ KERNELS: tuple[Kernel, ...] = (  # with those of lenses, of passes such as ids, 
     *IMAGE_KERNELS,
     forward.pass_kernel(RAY),
     order.pass_kernel(POINT),
-    order.pass_kernel(RAY),
     backward.SLOTS,
     POINT_ROWS_BACKWARD,
     FROM_SUMS,
@@ -91,7 +90,7 @@ DRAWN = [(pixel, channels) for pixel in (POINT, ABSOLUTE_POINT) for channels in 
 SLOW = {  # to compile: how many times as long as most, which take about 10 s of a processor
     **{forward.pass_kernel(*drawn, keeps).name: 6 for drawn in DRAWN for keeps in (False, True)},
     projection.PROJECT_BACKWARD.name: 4,
-    **{order.pass_kernel(pixel).name: 2 for pixel in (POINT, RAY)},
+    order.pass_kernel(POINT).name: 2,
     **{backward.step_kernel(*drawn).name: 3 for drawn in DRAWN},
     **{shading.gradients_kernel(n).name: 2 for n in shading.COMPILED_COEFFICIENTS[1:]},
 }
