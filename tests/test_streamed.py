@@ -317,9 +317,10 @@ def test_spark_draws_a_small_gaussian_below_large_ones():
 FAINT = replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20)
 LARGE = replace(make_scene(200, degree=4), log_scales=SCENE.log_scales + 3)
 FLAT = replace(LARGE, log_scales=LARGE.log_scales + torch.tensor([0.0, 0.0, -math.inf]), convention=ANTIALIASED)
+THIN = replace(FLAT[:1], log_scales=torch.full((1, 3), -math.inf))
 
 
-@pytest.mark.parametrize("scene", [FAINT, LARGE, SCENE.to(torch.float64), LARGE[:1], FLAT], ids=range(5))
+@pytest.mark.parametrize("scene", [FAINT, LARGE, SCENE.to(torch.float64), LARGE[:1], FLAT, THIN], ids=range(6))
 def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
     for tuning in {}, {"refine": True, "steps": 1, "overwrite": True}:
         levels = made(tmp_path, "rad", scene, **tuning)

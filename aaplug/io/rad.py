@@ -126,6 +126,7 @@ def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
     """The ranges of Spark's 8 bits: of colours all of 0 to 1, of scales up to the largest, which the tree rests on."""
     low, high = np.quantile(scene.base_colours, (1 - SPANNED, SPANNED)).tolist()
     thick = scene.log_scales[scene.log_scales.isfinite()]  # JSON has no infinity, the log of no thickness
+    thick = thick if len(thick) else torch.zeros(1)
     least, most = float(np.quantile(thick, 1 - SPANNED)), float(thick.max())
     spans = {"rgbMin": min(0.0, low), "rgbMax": max(1.0, high), "lnScaleMin": least, "lnScaleMax": most}
     for band, coefficients in enumerate(BANDS[:degree], 1):

@@ -233,6 +233,7 @@ class Renderer:
         fine = self._fine(camera, samples)
         light, render, splats = self._light(fine, samples), None, None
         for each in sample_cameras(fine):
+            splats = None  # the former frame's are freed before the next are made
             splats = self.splats(each, samples, light)
             image = self.paint(splats, fine.hw)
             pixels = average_samples(image, samples, weight)
@@ -345,16 +346,16 @@ class Renderer:
         return self._fine(camera, samples), samples
 
     def samples(self, camera: Camera) -> int:
-        """Number of samples along a pixel's side."""
+        """Number of samples along a pixel's side, in each frame of an exposure."""
         return self.sampling(camera)[0]
 
     @contract
     def sampling(self, camera: Camera, samples: int | None = None) -> tuple[int, float]:
         """Samples along a pixel's side, and the weight of those on either side of each; constants to gradients.
 
-        The frames of an exposure share the pixel: in all they have at least the recipe's samples.
+        The frames of an exposure share the pixel: in all they have at least the recipe's samples, and no neighbours.
 
-        samples: instead of the recipe's number.
+        samples: of each frame, instead of the recipe's number.
         """
         recipe, frames = self.recipe, frame_count(camera)
         weighs = recipe.neighbours > 0 and self.cutter is None and frames == 1
@@ -480,10 +481,10 @@ class Renderer:
         recipe, training, kernels = self.recipe_through(camera), self.training, self.kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules, clamped=not recipe.pixel.needs_depth_slopes)
-        if recipe.pixel.needs_depth_slopes:
-            splats = with_depth_slopes(splats, chunk, camera)
         if recipe.selection is not None:
             splats = asked("selection", recipe.selection, "__call__", splats, chunk)
+        if recipe.pixel.needs_depth_slopes:
+            splats = with_depth_slopes(splats, chunk, camera)
         own, screen = splats.sources, recipe.screen
         if isinstance(screen, ReadsColumns):
             found = {name: chunk.extras[name] for name in screen.columns if name in chunk.extras}

@@ -120,7 +120,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
         name = item.get("img_name", text)
         source.append(replace(centred(name, size, fx, cam_from_world, photos.find(name, item.place)), fy=fy))
     photos.check(source)
-    source = [*dict.fromkeys(source)]  # some runs list a view once per split
+    views = dict[tuple[object, ...], Camera]()
+    for camera in source:  # some runs list a view once per split
+        views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
+    source = list(views.values())
     short = [without_suffix(camera.name) for camera in source]
     if len({*short}) == len({camera.name for camera in source}):
         source = [replace(camera, name=name) for camera, name in zip(source, short, strict=True)]

@@ -59,7 +59,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
             section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
             part, at = _decoded(path, data, at, section, level, ends)
             parts += [Piece.of(part)] if len(part) else []
-    rows = in_a_row(parts)
+    rows = in_a_row(parts).in_memory()
     if rows.length != count:
         raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
     return Scene(path, name, *rows, EVIDENCE, notes=(f"compression level {level}",))

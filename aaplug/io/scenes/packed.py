@@ -44,6 +44,10 @@ class Piece(NamedTuple):
         """All rows of a scene in memory."""
         return cls(len(scene), scene.sh_degree, lambda start, stop: scene[start:stop])
 
+    def in_memory(self) -> "Piece":
+        """The same rows, read once."""
+        return Piece.of(self.load(0, self.length))
+
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:
     """Unit quaternions from three components in order, and the index of the largest, which is not stored."""

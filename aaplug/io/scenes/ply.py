@@ -196,8 +196,9 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
     records = np.zeros(len(scene), header.vertex.dtype)
-    assert not any(column.isnan().any() for column in scene.columns.values()), "a parameter is NaN"
-    values = {name: column.detach().cpu().numpy() for name, column in (columns_of(scene) | {**scene.extras}).items()}
+    columns = columns_of(scene)
+    assert not any(column.isnan().any() for column in columns.values()), "a parameter is NaN"
+    values = {name: column.detach().cpu().numpy() for name, column in (columns | {**scene.extras}).items()}
     old, document = {}, _document_of(scene)
     unchanged = any(c not in values or code != "f4" for c, code in header.vertex.codes.items())
     if unchanged and document and document.table and scene.origin:

@@ -78,7 +78,9 @@ class UsdFormat:
             if "refused" in told:
                 raise FormatError(path, told["refused"])
             prims = enumerate(told["prims"])
-            rows = in_a_row([Piece.of(_read(path, prim, number, arrays, told["up"])) for number, prim in prims])
+            rows = in_a_row(
+                [Piece.of(_read(path, prim, number, arrays, told["up"])) for number, prim in prims]
+            ).in_memory()
             said = told["record"]
             record = {} if said is None else {KEY: parse_json(said.encode(), path)}
             facts = read_record(path, record, Facts(EVIDENCE))
