@@ -25,7 +25,7 @@ import torch
 import aaplug
 from aaplug import RECIPES, Renderer, TrainingViews, UsageError
 from aaplug.core import projection, shading
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, Kernel, Kernels, where_signed
 from aaplug.core.projection import project
 from aaplug.gsplat.drawing import OnlyCompiled
 from aaplug.methods.pixel_kernels import point
@@ -734,6 +734,17 @@ def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(fail
     assert isinstance(chosen, Tiled)
     assert chosen.kernels is kernels
     assert "torch cannot compile slots here" in said[1]
+
+
+@pytest.mark.parametrize("reads_bits", [True, False])
+def test_signs_choose_as_comparisons_do(monkeypatch, reads_bits):
+    monkeypatch.setattr("aaplug.core.kernels.READS_BITS", reads_bits)
+    signs = torch.tensor([-torch.inf, -2.5, -1e-38, 0.0, 1e-38, 3.0, torch.inf])
+    values = torch.tensor([1.0, -2.0, torch.inf, 4.0, torch.nan, 0.0, -7.0])
+    for negative, chosen in ((True, signs < 0), (False, signs >= 0)):
+        result = where_signed(signs, values, negative=negative)
+        assert torch.equal(result[chosen].nan_to_num(5.0), values[chosen].nan_to_num(5.0))
+        assert (result[~chosen] == 0).all()
 
 
 def test_one_row_and_another_precision_are_left_to_the_eager_function():

@@ -16,6 +16,9 @@ from aaplug.system.errors import UsageError
 
 BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
 ONE_MORE = "+1"  # suffix of the name of a size
+SIGN_BIT = 31  # of a float32
+# From 2.13 on torch tells g++ the width of vectors.  Before, g++ may move numbers through memory to read their bits.
+READS_BITS = torch.__version__ >= "2.13"
 EXAMPLE_SIZE = 100_000  # rows, as many as in real work: inductor chooses by them which loops use threads
 
 
@@ -112,6 +115,17 @@ class Kernels:
 def materialized(x: Tensor) -> Tensor:
     """x itself.  A compiled kernel then computes it once, in a loop of its own, and not again at each use."""
     return x.as_strided(x.shape, x.stride()) if torch.compiler.is_compiling() else x
+
+
+def where_signed(sign: Tensor, value: Tensor, negative: bool) -> Tensor:
+    """`value` where `sign` is negative, or where it is not, else 0, for compiled kernels.
+
+    Inductor makes a vector of a comparison and a mask of that vector again, which costs more than reading signs.
+    """
+    if READS_BITS and value.dtype == torch.float32:
+        signs = sign.view(torch.int32) >> SIGN_BIT  # all bits, or none
+        return (value.view(torch.int32) & (signs if negative else ~signs)).view(torch.float32)
+    return torch.where(sign < 0 if negative else sign >= 0, value, 0.0)
 
 
 EAGER = Kernels()

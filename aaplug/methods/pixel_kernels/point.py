@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from aaplug.core.ellipses import whitening, whitening_columns
 from aaplug.core.interfaces import Limits, Pixels
-from aaplug.core.kernels import Kernel, Kernels, backward_of
+from aaplug.core.kernels import Kernel, Kernels, backward_of, where_signed
 from aaplug.core.projection import sum_of
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
@@ -126,7 +126,7 @@ def exp2_of(h: Float[Tensor, "*any"], limits: Limits) -> Float[Tensor, "*any"]:
     if torch.compiler.is_compiling():
         root = _polynomial(h, ROOT_OF_EXP2).pow(2 ** (SQUARINGS - 1))  # compiled to squarings
         # the last squaring comes after the cut-off, so that 1 - alpha is one instruction with it
-        return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, root, 0.0).square()
+        return where_signed(h - (limits.log2_min_alpha - LOG2_PADDING), root, negative=False).square()
     # The exponent is clamped, because subnormal numbers are slow.
     return limits.cut((h + LOG2_PADDING).clamp_(min=LOG2_PADDING).exp2_())
 

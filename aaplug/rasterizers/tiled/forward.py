@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels, ReadsRays
-from aaplug.core.kernels import EAGER, Kernel, Kernels, materialized
+from aaplug.core.kernels import EAGER, Kernel, Kernels, materialized, where_signed
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, forms_at_corners, next_rows, tile_centres
@@ -246,7 +246,7 @@ def less(x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t
 def where_above(bound: float | Tensor, test: Tensor, value: Tensor) -> Tensor:
     """`value` where `test` > `bound`, else 0; needs bound >= 0 and 0 <= value <= 1."""
     if isinstance(bound, Tensor) or torch.compiler.is_compiling():
-        return torch.where(test > bound, value, 0.0)
+        return where_signed(bound - test, value, negative=True)
     return torch.minimum(torch.threshold(test, bound, 0.0).mul_(MASK_GAIN), value)
 
 
