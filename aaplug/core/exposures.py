@@ -28,7 +28,8 @@ FAINT = 1 / 32  # opacity: of splats that are fainter once they are spread, some
 AXIS_WEIGHTS = 0.01, 0.01, 0.1, 0.1, 0.01  # of x and y in the pixel and in the opening, and of time
 SHORTEST = 1e-12  # px²: least variance of a path, at which roots have gradients
 MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
-MAX_GENERATORS = 256  # lattices tried
+MAX_TRIED = 256  # lattices of each size
+MAX_COMPARED = 256  # points of lattices of two sizes
 
 
 def frame_count(camera: Camera) -> int:
@@ -157,19 +158,23 @@ def opening(aperture: Aperture, u: float, v: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def lattice(count: int) -> Float[Tensor, "count 5"]:
-    """Points of (0, 1)⁵ of mean 1/2: the rank-1 lattice of Korobov's form (1959) of least weighted P₂.
+    """Points of (0, 1)⁵ of mean 1/2: a rank-1 lattice of Korobov's form (1959), of least weighted P₂.
 
     Along each axis there is one point in each of `count` equal parts.  P₂ (Sloan and Joe 1994) with a weight for each
-    axis (Sloan and Woźniakowski 1998): alike for all, it leaves 17 or 61 points in a few rows of the opening.
+    axis (Sloan and Woźniakowski 1998): alike for all, it leaves 17 or 61 points in a few rows of the opening.  Where
+    `count` has many divisors, a lattice of one point more, which is left out, is better (Fang and Wang 1994).
     """
-    index, weights = torch.arange(count), torch.tensor(AXIS_WEIGHTS, dtype=torch.float64)
-    best, least = None, math.inf
-    tried = [a for a in range(1, max(2, count)) if math.gcd(a, count) == 1]
-    for generator in tried[:: -(-len(tried) // MAX_GENERATORS)]:
-        powers = [pow(generator, power, count) for power in range(len(AXIS_WEIGHTS))]
-        points = ((index[:, None] * torch.tensor(powers)) % count).double() / count
-        excess = float((1 + weights * 2 * math.pi**2 * (points * (points - 1) + 1 / 6)).prod(dim=1).mean())
-        if excess < least:
-            best, least = points, excess
-    assert best is not None
-    return best + 0.5 / count
+    weights = torch.tensor(AXIS_WEIGHTS, dtype=torch.float64)
+
+    def excess(offsets: Float[Tensor, "*n 5"]) -> float:
+        return float((1 + weights * 2 * math.pi**2 * (offsets * (offsets - 1) + 1 / 6)).prod(dim=-1).mean())
+
+    candidates = []
+    for size in (count, count + 1) if count <= MAX_COMPARED else (count,):
+        index, tried = torch.arange(size)[:, None], [a for a in range(1, max(2, size)) if math.gcd(a, size) == 1]
+        powers = [[pow(a, power, size) for power in range(len(weights))] for a in tried[:: -(-len(tried) // MAX_TRIED)]]
+        lattices = (index * torch.tensor(each) % size for each in powers)
+        parts = min(lattices, key=lambda parts: excess(parts.double() / size))
+        candidates.append((parts[size - count :] - (size - count) + 0.5).double() / count)  # without the point 0
+    first, *other = candidates
+    return min(candidates, key=lambda points: excess((points[:, None] - points) % 1)) if other else first

@@ -23,7 +23,7 @@ from aaplug.system.errors import UsageError, counted
 
 Drawn = TypeVar("Drawn", bound=ImageOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
-SAMPLES, FAST_SAMPLES = 16, 5  # a lattice of a prime number of points fills the opening far better than one of 4 or 6
+SAMPLES, FAST_SAMPLES = 16, 5  # of an exposure
 
 
 def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
