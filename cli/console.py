@@ -145,7 +145,7 @@ class Terminal(Monitor):
         def tell_log(done: int, total: int) -> None:
             nonlocal told
             now, (rate, words) = time.monotonic(), pace(done)
-            if done == total or now - told >= LINE_SECONDS:
+            if total and (done == total or now - told >= LINE_SECONDS):
                 eta = f", about {(total - done) / rate:.0f} s left" if rate and done < total else ""
                 all_of = counted(total, unit[:-1]) if unit.endswith("s") else f"{total} {unit}"
                 say(f"{what}: {done:,} of {all_of}{words}{eta}")

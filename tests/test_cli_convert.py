@@ -85,6 +85,7 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer,
 def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention, advice):
     _, err = cli.done(f"{CONVERT} --for {viewer} --steps 0 --threads 1")
     assert advice in " ".join(err.split())
+    assert "steps" not in err  # there are none
     assert read_scene(Path("c.ply")).gaussians().convention == convention
 
 

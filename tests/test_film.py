@@ -310,8 +310,10 @@ def test_a_lens_that_bends_moves_but_has_no_aperture():
 
 
 def test_a_camera_to_is_one_view_for_one():
-    with pytest.raises(UsageError, match=r"camera_to: names one view, for one of `views` .*; got 1 view for 2 views"):
-        filmed([VIEW, VIEW], ImageOptions(), False, camera_to=[MOVED])
+    frames = [replace(VIEW, name=f"a-{number}") for number in (1, 2)]
+    problem = "camera_to: moves one view to one other, of no path and no scene in time; got a-1, a-2 to b"
+    with pytest.raises(UsageError, match=problem):
+        filmed(frames, ImageOptions(), False, camera_to=[replace(MOVED, name="b")])
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ from aaplug.system.cores import FREE_CORES
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene, moved, run_python, with_photographs
+from tests.test_announce import Heard
 
 F64 = torch.float64
 EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
@@ -541,7 +542,9 @@ def test_evaluate_tells_errors_of_poses_from_others(photographed):
     scene, cameras = photographed
     off = CameraSet(*[tuple(moved_by(view, CHANGE, DEPTH) for view in cameras.train)] * 2)
     how = {"min_seen": 0.0, "recipe": "classic", "scale": (1.0,), "metric": "psnr", "rasterizer": "eager"}
-    before, after = (aaplug.evaluate(scene, off, None, poses=poses, **how) for poses in (False, True))
+    heard = Heard(), Heard()
+    before, after = (aaplug.evaluate(scene, off, None, poses=p, monitor=heard[p], **how) for p in (False, True))
+    assert [line for line in heard[1].said if "poses moved" not in line] == heard[0].said
     gained = mean(after.select("classic", 1.0), "PSNR") - mean(before.select("classic", 1.0), "PSNR")
     assert gained > 6
     [note] = [note for note in after.protocol["cameras"]["notes"] if "poses" in note]

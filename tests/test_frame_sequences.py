@@ -33,7 +33,7 @@ def test_a_name_with_places_or_a_folder_with_a_format_is_a_sequence(cli):
 
 def test_a_sequence_begins_at_the_number_of_its_plate(cli):
     words = f"{WORDS} out/f.####.png --first-frame"
-    cli.done(f"{words} 1001")
+    assert "6 frames of 32x24 px, 30 per second" in cli.done(f"{words} 1001")[1]
     assert [*bytes_of("out")] == [*(f"f.{i}.png" for i in range(1001, 1007)), "f.json"]
     cli.refused(f"{words} 1003 --resume", "holds f.1001.png, f.1002.png beside the 6 frames; remove them")
     cli.refused(f"{words} -1", "--first-frame: takes a whole number 0..")

@@ -123,7 +123,8 @@ def test_a_video_tells_the_sampling_rate_of_its_pixels(cli, monkeypatch, lens):
 
 
 def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):
-    cli.done("video scene.ply --cameras . -o v.webm --resolution 320x240 --seconds 0.2 --fps 20")
+    _, err = cli.done("video scene.ply --cameras . -o v.webm --resolution 320x240 --seconds 0.2 --fps 20")
+    assert "4 frames of 320x240 px per pane, 20 per second" in err
     found, _ = read(Path("v.webm"))
     far = found[2, :, -320:].astype(int)  # the turning point: 1/8, with an inset of 100 px
     assert np.abs(far[-100:, -100:] - far[:1, :1]).max() > 60

@@ -19,7 +19,7 @@ from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.image_formats import Storage
 from aaplug.options.verbs import DEFAULT_SENSOR, ImageOptions, check_side, size_of
 from aaplug.rendering.job import Job
-from aaplug.system.errors import UsageError, counted
+from aaplug.system.errors import UsageError, listing
 
 Drawn = TypeVar("Drawn", bound=ImageOptions)
 STRETCH = 0.02  # of the aspect, above which images are said to be stretched
@@ -150,8 +150,8 @@ def filmed(
             raise UsageError(option, "moves between views of different sizes or lenses; give `resolution` or `lens`")
     if camera_to:
         if path or not len(views) == len(camera_to) == 1:
-            got = f"got {counted(len(camera_to), 'view')} for {counted(len(views), 'view')}"
-            raise UsageError("camera_to", f"names one view, for one of `views` that is not of a path; {got}")
+            got = " to ".join(listing([view.name for view in each], most=3) for each in (views, camera_to))
+            raise UsageError("camera_to", f"moves one view to one other, of no path and no scene in time; got {got}")
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]

@@ -117,6 +117,11 @@ class Job(Generic[O_co]):
             self.check_fit(look)
         return look
 
+    def second_look(self: "Job[ViewOptions]", look: Renderer) -> Renderer:
+        """The scene as training showed it to these cameras, drawn as an earlier look was; says nothing."""
+        margin, least = self.options.cull_margin, self.options.min_seen
+        return own_look(self.scene, self.cameras, look.rasterizer, look.background, margin, least)
+
     def check_fit(self: "Job[FrameOptions]", look: Renderer) -> None:
         """Say how well scene and cameras fit, which takes seconds; raises FrameError as `look`."""
         if not len(look.scene) or self.cameras.assumed:

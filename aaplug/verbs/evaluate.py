@@ -57,10 +57,10 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     images = None if folder is None else ImageStore.of(folder, show, views, everything)
     with running(options, folder, check, job.inputs, folder=True) as workers:
         frames = len(views) * len(recipes) * len(scales)
+        look = job.look(frames, gradients=options.poses)
         if options.poses:
-            job = replace(job, cameras=refined(job.look(frames, gradients=True), job.cameras, views, job.monitor)[0])
-            views = job.views
-        look = job.look(frames)
+            job = replace(job, cameras=refined(look, job.cameras, views, job.monitor)[0])
+            look, views = job.second_look(look), job.views
         renderers = renderers_of(look, recipes)
         task = Task(renderers, scales, views, Truth(look, source, protocol), metrics)
         job.announce([*task.renderers.values()], task.sized_views, cost=task.cost)

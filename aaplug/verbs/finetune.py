@@ -106,7 +106,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
         if options.poses:
             job = replace(job, cameras=refined(look, job.cameras, job.cameras.all, job.monitor)[0])
-            look = job.look(settings.steps, gradients=True)
+            look = job.second_look(look)
         train = job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
         fused = fuse_for(raw, look.training, viewer)

@@ -113,11 +113,11 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     with running(options, place, check, [*job.inputs, *path_file], folder=sequence is not None) as workers:
         look = job.look(len(views) * len(recipes))
         renderers = [look.by(recipe) for recipe in recipes]
-        size = f"{views[0].width}x{views[0].height}"
-        job.monitor.say(f"{counted(len(views), 'frame')} of {size} px per pane, {fps:g} per second")
+        panes, files = [(renderer, eye) for renderer in renderers for eye in eyes], list[list[Path]]()
+        size = f"{views[0].width}x{views[0].height} px{' per pane' * (len(panes) > 1)}"
+        job.monitor.say(f"{counted(len(views), 'frame')} of {size}, {fps:g} per second")
         job.announce(renderers * len(eyes), views, processes=workers.threads, fewer="seconds or frames per second")
         job.say_assumed(renderers[-1], views[0])
-        panes, files = [(renderer, eye) for renderer in renderers for eye in eyes], list[list[Path]]()
         with job.monitor.progress("rendering", "images") as tell:
 
             def tell_after(done: int) -> Tell:
