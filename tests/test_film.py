@@ -18,6 +18,7 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.options.verbs import ImageOptions
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
+from aaplug.verbs.render import description
 from tests.conftest import make_camera, make_scene
 from tests.test_camera_paths import document
 
@@ -358,6 +359,12 @@ def test_a_still_is_blurred_towards_another_view(tmp_path):
     how = {"min_seen": 0.0, "views": "a", "samples": 4}
     [written] = aaplug.render(scene, cameras, tmp_path / "a.png", camera_to="b", **how)
     assert [camera.name for camera in written.view.exposure.motion] == ["a", "b"]
+
+
+@pytest.mark.parametrize(("samples", "told"), [(1, "frame"), (16, "frames")])
+def test_how_many_frames_are_averaged_is_told(samples, told):
+    renderer = aaplug.Renderer.of(make_scene(20), [VIEW], "matched", min_seen=0.0)
+    assert description(renderer, [exposed(APERTURE, samples=samples)]).endswith(f", mean of {samples} {told}")
 
 
 def test_a_path_file_brings_its_aperture_and_shutter(tmp_path):

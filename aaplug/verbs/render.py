@@ -68,7 +68,7 @@ def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     counts, samples = (sorted({*map(count, views)}) for count in (frame_count, renderer.samples))
     grid = " or ".join(f"{n}×{n}" for n in samples)
     exposed = any(view.exposure for view in views)
-    mean = f", mean of {' or '.join(map(str, counts))} frames" * exposed
+    mean = f", mean of {' or '.join(map(str, counts))} frame{'s' * (counts != [1])}" * exposed
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     name = renderer.training.convention.name
     kind = one(f"{name} scene{' of 2D Gaussians' * renderer.scene.flat}")
