@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from aaplug import Aperture, CameraSet, Exposure, Render, UsageError, read_camer
 from aaplug.core.camera_paths import toward
 from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras, spread, spread_out
 from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
+from aaplug.core.light import transmittances
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.options.verbs import ImageOptions
@@ -139,6 +141,24 @@ def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
     assert splats.planes is not None
     lengths = (12 * (path[:, 0] + path[:, 2])).sqrt() / splats.planes[:, 0].norm(dim=1)
     assert torch.allclose(lengths, torch.full_like(lengths, angle), rtol=1e-3)
+
+
+def test_through_a_lens_transmittances_are_those_of_ellipses_of_the_image():
+    """Their gradients are compiled, and those of splats that a lens bends are not."""
+    camera = replace(VIEW, lens=EQUIDISTANT)
+    renderer = aaplug.Renderer.of(make_scene(200), [VIEW], "matched", min_seen=0.0)
+    splats, bent = renderer.splats(camera), []
+
+    def paint(drawn, planes=None, camera=None):
+        bent.append(drawn.planes is not None)
+        return renderer.paint(replace(drawn, planes=planes, camera=camera), VIEW.hw, (0.0, 0.0, 0.0))
+
+    seen = transmittances(splats, camera, 1 / 255, paint)
+    expected = transmittances(splats, camera, 1 / 255, partial(paint, planes=splats.planes, camera=camera))
+    assert not any(bent)
+    assert torch.equal(seen.isnan(), expected.isnan())
+    assert float((seen - expected).abs().nanmean()) < 0.005
+    assert float(expected.nanquantile(0.1)) < 0.5
 
 
 def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():

@@ -13,6 +13,7 @@ opaque.  m: splats.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -32,8 +33,10 @@ Paint = Callable[[Splats2D], Render]  # draws splats over black
 def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
     """Mean transmittance in front of each splat of a view.
 
-    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.
+    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.  Splats that
+    a lens bends are drawn as ellipses of the image, whose gradients are compiled.
     """
+    splats = replace(splats, planes=None, camera=None)
     with torch.enable_grad():
         colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
         total = paint(splats.with_columns({"rgb": colours})).rgb[..., 0].sum()
