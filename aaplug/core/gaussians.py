@@ -164,6 +164,8 @@ class Gaussians:
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several parts of one scene, at least one part, each with the same columns."""
     first = parts[0]
+    if len(parts) == 1:
+        return first
     for part in parts:
         kinds = [(*p.columns, *p.extras, p.means.dtype, p.sh.shape[1]) for p in (first, part)]
         if kinds[0] != kinds[1]:

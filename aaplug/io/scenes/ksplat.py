@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.scenes.packed import Piece, byte_opacities, floats, in_a_row, sh_of_colour
+from aaplug.io.scenes.packed import Piece, byte_opacities, floats, sh_of_colour
 from aaplug.io.scenes.rows import SceneFileOptions, by_name, check_count, library_errors
 from aaplug.io.scenes.scene import Scene
 from aaplug.io.scenes.splat import EVIDENCE
@@ -45,7 +45,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         data, none = path.read_bytes(), torch.zeros(0, 3)
-        parts = [Piece.of(Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), none[:, None]))]
+        parts = list[Gaussians]()
         if len(data) < MAIN_SIZE:
             raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")
         major, minor, number, count, level, *ends = MAIN.unpack_from(data)
@@ -58,8 +58,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         for index in range(number):
             section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
             part, at = _decoded(path, data, at, section, level, ends)
-            parts += [Piece.of(part)] if len(part) else []
-    rows = in_a_row(parts).in_memory()
+            parts += [part] if len(part) else []
+    rows = Piece.of(parts or [Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), none[:, None])])
     if rows.length != count:
         raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
     return Scene(path, name, *rows, EVIDENCE, notes=(f"compression level {level}",))

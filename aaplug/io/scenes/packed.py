@@ -40,13 +40,10 @@ class Piece(NamedTuple):
     load: Callable[[int, int], Gaussians]
 
     @classmethod
-    def of(cls, scene: Gaussians) -> "Piece":
-        """All rows of a scene in memory."""
+    def of(cls, parts: Sequence[Gaussians]) -> "Piece":
+        """All rows of these parts, at least one, in memory, with harmonics up to the highest degree."""
+        scene = joined([of_degree(part, max(p.sh_degree for p in parts)) for part in parts])
         return cls(len(scene), scene.sh_degree, lambda start, stop: scene[start:stop])
-
-    def in_memory(self) -> "Piece":
-        """The same rows, read once."""
-        return Piece.of(self.load(0, self.length))
 
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:
@@ -165,6 +162,6 @@ def in_a_row(pieces: Sequence[Piece]) -> Piece:
             if begin < end or (start == stop and not read):
                 read.append(of_degree(load(begin, max(begin, end)), degree))
             first += count
-        return joined(read) if len(read) > 1 else read[0]
+        return joined(read)
 
     return Piece(sum(piece.length for piece in pieces), degree, rows)

@@ -26,7 +26,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file, told_by_library
 from aaplug.io.cameras.usd import module
-from aaplug.io.scenes.packed import Piece, floats, half_turn_about_z, in_a_row, logit_of, standing
+from aaplug.io.scenes.packed import Piece, floats, half_turn_about_z, logit_of, standing
 from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
 from aaplug.io.scenes.rows import SceneFileOptions, library_errors
 from aaplug.io.scenes.scene import Scene
@@ -78,9 +78,7 @@ class UsdFormat:
             if "refused" in told:
                 raise FormatError(path, told["refused"])
             prims = enumerate(told["prims"])
-            rows = in_a_row(
-                [Piece.of(_read(path, prim, number, arrays, told["up"])) for number, prim in prims]
-            ).in_memory()
+            rows = Piece.of([_read(path, prim, number, arrays, told["up"]) for number, prim in prims])
             said = told["record"]
             record = {} if said is None else {KEY: parse_json(said.encode(), path)}
             facts = read_record(path, record, Facts(EVIDENCE))
