@@ -81,6 +81,7 @@ def test_the_integers_that_the_extension_allows_are_read(tmp_path: Path):
 PRIMITIVE = ("meshes", 0, "primitives", 0)
 WRONG = [
     (("buffers", 0, "uri"), "..%2Fa.bin", "a file in the same folder"),
+    (("buffers", 0, "uri"), "https://a.example/b.bin", "a file in the same folder"),
     (("buffers", 0, "uri"), "b%20c.bin", "b.gltf: refers to b c.bin, which is not there"),
     (("extensionsRequired",), ["EXT_meshopt_compression"], "extensionsRequired should be of"),
     (("nodes",), [{"mesh": 0, "scale": [1, 2, 1]}], "a turn, a move and one scale"),

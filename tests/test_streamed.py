@@ -257,7 +257,7 @@ def test_nothing_is_left_of_a_longer_run_that_was_cut_short_and_parts_are_for_th
         assert read_scene(folder / stream.content).convention == VIEWERS[stream.viewer].convention
     if to != "sog":
         for path in (out, out / stream.index):
-            with pytest.raises(FormatError, match=f"{stream.index}: holds levels for another viewer"):
+            with pytest.raises(FormatError, match=f"{stream.index}: holds levels for a web viewer"):
                 read_scene(path)
 
 

@@ -28,6 +28,7 @@ from tests.conftest import click, drag, make_camera, make_scene, with_photograph
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
 PICTURE = "#stage canvas"
+LEVELS = "http://levels.example/"
 ESCAPED = NASTY.replace("\\", "\\\\")  # in a selector
 
 
@@ -373,6 +374,13 @@ def test_a_page_of_streamed_levels_says_why_it_shows_none(browser, tmp_path):
     page, script = browser.new_page(), (tmp_path / "problems.js").read_text()
     page.set_content(f"<canvas></canvas><script>{script}</script><script src=nowhere:viewer.js></script>")
     assert page.locator("p").inner_text() == "nowhere:viewer.js cannot be read"
+    page.close()
+    page = browser.new_page()
+    body = f"<canvas></canvas><script>{script}</script><script>fetch('part.webp')</script>"
+    status = {LEVELS: 200}
+    page.route("**", lambda r: r.fulfill(status=status.get(r.request.url, 404), content_type="text/html", body=body))
+    page.goto(LEVELS)
+    assert page.locator("p").inner_text() == f"{LEVELS}part.webp is not on the server"
     page.close()
 
 

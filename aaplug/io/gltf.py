@@ -163,7 +163,8 @@ class Gltf:
             return Buffer(self.path, len(held), 0, held)
         try:
             file, home = (self.path.parent / unquote(address)).resolve(), self.path.parent.resolve()
-            buffer.place.expect(file.is_relative_to(home), "uri", "a file in the same folder", address)
+            beside = "://" not in address and file.is_relative_to(home)
+            buffer.place.expect(beside, "uri", "a file in the same folder", address)
             size = file.stat().st_size
         except FileNotFoundError as error:
             raise FormatError(self.path, f"refers to {unquote(address)}, which is not there") from error

@@ -107,7 +107,8 @@ class Viewer:
             fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
             if not fitting or self == DISC_VIEWER:  # the others show no discs
                 return f"no viewer is known to open {file}"
-            hint = f"--for {listing(fitting)} writes one for its own rule"
+            own = " or ".join(f".{name}" for name in self.formats)
+            hint = f"write a {own}, or --for {listing(fitting)} writes one for its own rule"
             if others:
                 hint = f"--for {others[0].name} writes one that {others[0].program} opens"
             return f"no viewer of this rule is known to open {file}; {hint}"

@@ -139,7 +139,7 @@ def read_scene(
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     format = next((each for each in formats if asked("scene format", each, "sniff", path, head)), None)
     if format is None and (path.name in STREAM_INDEXES.values() or path.suffix.lower() == RAD_SUFFIX):
-        raise FormatError(path, "holds levels for another viewer; name the scene that they were made of")
+        raise FormatError(path, "holds levels for a web viewer alone; name the scene that they were made of")
     if format is None:
         if head.startswith((sog.ZIP_SIGNATURE, spz.GZIP_SIGNATURE)):
             raise FormatError(path, "is an archive; unpack it, and name the scene's file that was in it")

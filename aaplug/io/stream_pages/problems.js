@@ -12,6 +12,10 @@ addEventListener("error", ({ error, message, target }) => {
   else if (message && !message.startsWith("ResizeObserver")) tell(`This page failed: ${error ?? message}`);
 }, true);
 addEventListener("unhandledrejection", ({ reason }) => tell(`This page failed: ${reason}`));
+new PerformanceObserver((list) => { // viewers try again in silence, or for good
+  const missing = list.getEntries().find(({ responseStatus }) => responseStatus === 404);
+  if (missing) tell(`${missing.name} is not on the server`);
+}).observe({ type: "resource", buffered: true });
 if (location.protocol === "file:") {
   tell("A browser opens levels from a server only: run “python -m http.server” in this folder, and open http://localhost:8000.");
 }
