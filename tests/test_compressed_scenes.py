@@ -316,6 +316,9 @@ def test_a_format_says_what_it_loses(tmp_path: Path, expected, caplog, monkeypat
     [record] = caplog.records
     lost = "harmonics above degree 0 and the record of its training (mip)"
     assert f"a .{name} cannot hold {lost}; a .ply can" in record.message
+    caplog.clear()
+    write_scene(tmp_path / "flagged.spz", replace(expected, convention=MIP, fused=(Fusion("finetune"),)))
+    assert "a .spz cannot hold the record of what was fused; a .ply can" in caplog.text
 
 
 def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):

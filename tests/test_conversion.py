@@ -35,7 +35,7 @@ def test_what_cannot_be_fused_is_refused(cameras):
         fuse(replace(scene, convention=MIP), training, FORMS["matched-energy"])  # without a stored filter
     converted = fuse(scene, training, FORMS["matched-energy"])
     for form in FORMS.values():
-        with pytest.raises(UsageError, match=r"already has matched-energy.*; `aaplug merge` of it alone"):
+        with pytest.raises(UsageError, match=r"already has matched-energy.*; convert the scene that it was made of"):
             fuse(converted, training, form)
 
 

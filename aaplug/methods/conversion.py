@@ -108,5 +108,5 @@ def _check_discs(scene: Gaussians) -> None:
 
 def _check_unblurred(scene: Gaussians) -> None:
     if blurs := blurring(scene.fused):
-        problem = f"already has {described_fusions(blurs)} fused; converting it again would blur it twice"
-        raise UsageError(scene.name, f"{problem}; {MERGE_ALONE}")
+        problem = f"already has {described_fusions(blurs)} fused, and converting it again would blur it twice"
+        raise UsageError(scene.name, f"{problem}; convert the scene that it was made of, or {MERGE_ALONE}")

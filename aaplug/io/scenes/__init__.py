@@ -226,8 +226,10 @@ def _losses(scene: Gaussians, keeps: Collection[str]) -> Iterator[str]:
         yield f"the {beside}"
     if "harmonics" not in keeps and scene.sh_degree:
         yield "harmonics above degree 0"
-    if "record" not in keeps and (scene.convention != told or scene.fused):
+    if "record" not in keeps and scene.convention != told:
         yield f"the record of its training ({scene.convention.name})"
+    if "record" not in keeps and scene.fused:
+        yield "the record of what was fused"
 
 
 def kept_by(format: SceneFormat | None) -> Collection[str]:
