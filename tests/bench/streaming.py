@@ -36,6 +36,7 @@ from aaplug.io.streamed import SETTINGS, STREAMS, write_index, write_level
 from tests.bench import heading, row, scenes
 from tests.bench.scenes import decibels
 from tests.bench.viewers import shoot
+from tests.conftest import SAMPLE
 
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
 PAGES = {"sog": "playcanvas", "3dtiles": "cesium", "rad": "spark"}
@@ -45,8 +46,8 @@ SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 
 
 def main(
-    scene: Path,
-    cameras: Path,
+    scene: Path = SAMPLE / "chair.ply",
+    cameras: Path = SAMPLE,
     to: Sequence[StreamName] = ("sog", "3dtiles", "rad"),
     work: Path = Path("out/streaming"),
     modules: Path = Path("tests/bench/viewer_pages"),
