@@ -30,6 +30,7 @@ SHORTEST = 1e-12  # px²: least variance of a path, at which roots have gradient
 MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
 MAX_TRIED = 256  # lattices of each size
 MAX_COMPARED = 256  # points of lattices of two sizes
+CLEARLY_LESS = 0.97  # share of a lattice's own P₂ below which one of another size takes its place
 
 
 def frame_count(camera: Camera) -> int:
@@ -167,7 +168,7 @@ def lattice(count: int) -> Float[Tensor, "count 5"]:
     weights = torch.tensor(AXIS_WEIGHTS, dtype=torch.float64)
 
     def excess(offsets: Float[Tensor, "*n 5"]) -> float:
-        return float((1 + weights * 2 * math.pi**2 * (offsets * (offsets - 1) + 1 / 6)).prod(dim=-1).mean())
+        return float((weights * 2 * math.pi**2 * (offsets * (offsets - 1) + 1 / 6) + 1).prod(dim=-1).mean() - 1)
 
     candidates = []
     for size in (count, count + 1) if count <= MAX_COMPARED else (count,):
@@ -176,5 +177,6 @@ def lattice(count: int) -> Float[Tensor, "count 5"]:
         lattices = (index * torch.tensor(each) % size for each in powers)
         parts = min(lattices, key=lambda parts: excess(parts.double() / size))
         candidates.append((parts[size - count :] - (size - count) + 0.5).double() / count)  # without the point 0
-    first, *other = candidates
-    return min(candidates, key=lambda points: excess((points[:, None] - points) % 1)) if other else first
+    own, *larger = candidates
+    least = CLEARLY_LESS * excess((own[:, None] - own) % 1) if larger else 0.0
+    return next((points for points in larger if excess((points[:, None] - points) % 1) < least), own)

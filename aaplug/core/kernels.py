@@ -120,6 +120,7 @@ def materialized(x: Tensor) -> Tensor:
 def where_signed(sign: Tensor, value: Tensor, negative: bool) -> Tensor:
     """`value` where `sign` is negative, or where it is not, else 0, for compiled kernels.
 
+    sign: finite, of the shape of `value`, and +0 where it is zero.  float32 is chosen by its bits, without gradients.
     Inductor makes a vector of a comparison and a mask of that vector again, which costs more than reading signs.
     """
     if READS_BITS and value.dtype == torch.float32:

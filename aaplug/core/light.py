@@ -33,10 +33,8 @@ Paint = Callable[[Splats2D], Render]  # draws splats over black
 def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
     """Mean transmittance in front of each splat of a view.
 
-    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.  Splats that
-    a lens bends are drawn as ellipses of the image, whose gradients are compiled.
+    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.
     """
-    splats = replace(splats, planes=None, camera=None)
     with torch.enable_grad():
         colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
         total = paint(splats.with_columns({"rgb": colours})).rgb[..., 0].sum()
@@ -55,11 +53,13 @@ def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Pa
 def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
     """Factors of opacity for the splats of a sharp view, if the camera's exposure spreads them without end.
 
-    `spread_out` takes less of them for a splat that is spread less.
+    `spread_out` takes less of them for a splat that is spread less.  Through a lens, ellipses of the image stand for
+    splats, as their gradients are compiled; but not in a panorama, which stretches splats at its poles.
     """
     assert camera.exposure is not None
     least = LEAST_SEEN * camera.exposure.samples ** (1 / 3)
-    seen = transmittances(splats, camera, min_alpha, paint)
+    drawn = splats if camera.lens.period else replace(splats, planes=None, camera=None)
+    seen = transmittances(drawn, camera, min_alpha, paint)
     seen = torch.where(seen.isnan(), seen.nanmean().nan_to_num(1.0), seen).clamp(min=least)
     spread, opacities = spread_out(splats, camera, seen)
     cover = -torch.log1p(-paint(spread).alpha.clamp(max=1.0))

@@ -151,7 +151,7 @@ def filmed(
     if camera_to:
         if path or not len(views) == len(camera_to) == 1:
             got = " to ".join(listing([view.name for view in each], most=3) for each in (views, camera_to))
-            raise UsageError("camera_to", f"moves one view to one other, of no path and no scene in time; got {got}")
+            raise UsageError("camera_to", f"moves one view to one other, not a path or a scene in time; got {got}")
         if options.shutter is not None:
             raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
         motions = [(_instant(views[0]), _instant(camera_to[0]))]
