@@ -35,7 +35,8 @@ def test_what_cannot_be_fused_is_refused(cameras):
         fuse(replace(scene, convention=MIP), training, FORMS["matched-energy"])  # without a stored filter
     converted = fuse(scene, training, FORMS["matched-energy"])
     for form in FORMS.values():
-        with pytest.raises(UsageError, match=r"already has matched-energy.*; convert the scene that it was made of"):
+        cure = "; convert the scene that it was made of, or `aaplug merge` of it alone"
+        with pytest.raises(UsageError, match=f"already has matched-energy.*{cure}"):
             fuse(converted, training, form)
 
 

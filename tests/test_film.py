@@ -42,6 +42,14 @@ def test_a_lattice_has_one_point_in_each_part_of_each_axis(count):
     assert points.mean(dim=0).tolist() == pytest.approx([0.5] * 5)
 
 
+@pytest.mark.parametrize("count", [5, 13, 16, 17, 31, 61, 64, 101, 128, 256])
+def test_no_two_points_of_a_lattice_are_close_in_the_opening(count):
+    """In the square, whose sides are joined, a grid's least distance is 1 / √count."""
+    places = lattice(count)[:, 2:4]
+    offsets = (places[:, None] - places + 0.5) % 1 - 0.5
+    assert float(offsets.norm(dim=2).fill_diagonal_(1.0).min()) > 0.6 / math.sqrt(count)
+
+
 def test_lattices_fill_the_opening():
     """In the square a grid's least distance is 1 / √count, and no place is farther than 0.71 / √count from it."""
     side = (torch.arange(50).double() + 0.5) / 50

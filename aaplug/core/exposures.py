@@ -165,18 +165,25 @@ def lattice(count: int) -> Float[Tensor, "count 5"]:
     axis (Sloan and Woźniakowski 1998): alike for all, it leaves 17 or 61 points in a few rows of the opening.  Where
     `count` has many divisors, a lattice of one point more, which is left out, is better (Fang and Wang 1994).
     """
-    weights = torch.tensor(AXIS_WEIGHTS, dtype=torch.float64)
+    own = _lattice_of(count, count)
+    if count > MAX_COMPARED:
+        return own
+    other = _lattice_of(count + 1, count)
+    excess, least = (_excess((points[:, None] - points) % 1) for points in (other, own))
+    return other if excess < CLEARLY_LESS * least else own
 
-    def excess(offsets: Float[Tensor, "*n 5"]) -> float:
-        return float((weights * 2 * math.pi**2 * (offsets * (offsets - 1) + 1 / 6) + 1).prod(dim=-1).mean() - 1)
 
-    candidates = []
-    for size in (count, count + 1) if count <= MAX_COMPARED else (count,):
-        index, tried = torch.arange(size)[:, None], [a for a in range(1, max(2, size)) if math.gcd(a, size) == 1]
-        powers = [[pow(a, power, size) for power in range(len(weights))] for a in tried[:: -(-len(tried) // MAX_TRIED)]]
-        lattices = (index * torch.tensor(each) % size for each in powers)
-        parts = min(lattices, key=lambda parts: excess(parts.double() / size))
-        candidates.append((parts[size - count :] - (size - count) + 0.5).double() / count)  # without the point 0
-    own, *larger = candidates
-    least = CLEARLY_LESS * excess((own[:, None] - own) % 1) if larger else 0.0
-    return next((points for points in larger if excess((points[:, None] - points) % 1) < least), own)
+def _lattice_of(size: int, count: int) -> Float[Tensor, "count 5"]:
+    """The last `count` points of the lattice of `size` points that has the least excess, each in its part."""
+    index, tried = torch.arange(size)[:, None], [a for a in range(1, max(2, size)) if math.gcd(a, size) == 1]
+    powers = [[pow(a, n, size) for n in range(len(AXIS_WEIGHTS))] for a in tried[:: -(-len(tried) // MAX_TRIED)]]
+    lattices = (index * torch.tensor(each) % size for each in powers)
+    parts = min(lattices, key=lambda parts: _excess(parts.double() / size))
+    left = size - count
+    return (parts[left:] - left + 0.5).double() / count
+
+
+def _excess(offsets: Float[Tensor, "*n 5"]) -> float:
+    """Weighted P₂ of points with these offsets from each other, modulo 1."""
+    terms = torch.tensor(AXIS_WEIGHTS, dtype=torch.float64) * 2 * math.pi**2 * (offsets * (offsets - 1) + 1 / 6)
+    return float((1 + terms).prod(dim=-1).mean() - 1)

@@ -12,7 +12,7 @@ addEventListener("error", ({ error, message, target }) => {
   else if (message && !message.startsWith("ResizeObserver")) tell(`This page failed: ${error ?? message}`);
 }, true);
 addEventListener("unhandledrejection", ({ reason }) => tell(`This page failed: ${reason}`));
-new PerformanceObserver((list) => { // viewers try again in silence, or for good
+new PerformanceObserver((list) => { // of which some viewers say nothing
   const missing = list.getEntries().find(({ responseStatus }) => responseStatus === 404);
   if (missing) tell(`${missing.name} is not on the server`);
 }).observe({ type: "resource", buffered: true });
