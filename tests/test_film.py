@@ -12,8 +12,7 @@ import aaplug
 from aaplug import Aperture, CameraSet, Exposure, Render, UsageError, read_camera_path
 from aaplug.core.camera_paths import toward
 from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras, spread, spread_out
-from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE, Lens
-from aaplug.core.light import lights, transmittances
+from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.options.verbs import ImageOptions
@@ -150,28 +149,6 @@ def test_through_a_fisheye_a_path_is_as_long_as_its_angle():
     assert splats.planes is not None
     lengths = (12 * (path[:, 0] + path[:, 2])).sqrt() / splats.planes[:, 0].norm(dim=1)
     assert torch.allclose(lengths, torch.full_like(lengths, angle), rtol=1e-3)
-
-
-@pytest.mark.parametrize(("lens", "bent"), [(EQUIDISTANT, False), (EQUIRECT, True)])
-def test_light_through_a_lens_is_that_of_ellipses_but_in_a_panorama(lens, bent):
-    """The gradients of ellipses are compiled, and those of splats that a lens bends are not."""
-    camera = replace(VIEW, lens=lens)
-    renderer = aaplug.Renderer.of(make_scene(200), [VIEW], "matched", min_seen=0.0)
-    splats, drawn = renderer.splats(camera), []
-
-    def paint(splats):
-        drawn.append(splats.planes is not None)
-        return renderer.paint(splats, VIEW.hw, (0.0, 0.0, 0.0))
-
-    lights(splats, replace(camera, exposure=Exposure(None, (VIEW, MOVED), 1)), 1 / 255, paint)
-    assert drawn == [bent, True]
-    flat, whole = (
-        transmittances(each, camera, 1 / 255, paint) for each in (replace(splats, planes=None, camera=None), splats)
-    )
-    assert float(whole.nanquantile(0.1)) < 0.5
-    if not bent:
-        assert torch.equal(flat.isnan(), whole.isnan())
-        assert float((flat - whole).abs().nanmean()) < 0.005
 
 
 def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():

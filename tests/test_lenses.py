@@ -12,6 +12,7 @@ import torch
 
 from aaplug import RULES_3DGS, Camera, Renderer, TrainingViews, UsageError
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
+from aaplug.core.light import transmittances
 from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.io.lenses import Distortion, undistorted, with_lenses
 from aaplug.io.photographs import read_photo
@@ -162,10 +163,6 @@ def test_places_are_opencvs(name):
 
 
 def test_derivatives_are_those_of_places(lens):
-    if lens == EQUIRECT:
-        with pytest.raises(UsageError, match="equirect image, which has a seam"):
-            lens.derivatives(some_rays(lens))
-        return
     rays = 2.5 * some_rays(lens)
     rays[0] = torch.tensor([0.0, 0.0, 2.0])
     steps = 1e-6 * torch.eye(3, dtype=torch.float64)
@@ -184,6 +181,32 @@ def test_beyond_its_image_a_distorting_pinhole_is_no_steeper():
     spread, inside = splats.covs[:, 0] + splats.covs[:, 2], (camera.lens.places(points).abs() < 1.3).all(dim=1)
     assert spread.max() < 1.1 * spread[inside].max()
     assert spread.max() > 1.5 * spread[(camera.lens.places(points).abs() < 1).all(dim=1)].max(), "the margin counts"
+
+
+def test_the_light_of_splats_is_that_of_ellipses_of_the_image(lens, monkeypatch):
+    """Their gradients are compiled, and those of splats that a lens bends are not."""
+    scene, view, drawn = make_scene(200), replace(make_camera((0.0, -4.0, 0.0)), lens=lens), []
+
+    def seen(scene, view=view):
+        renderer = Renderer.of(scene, [view], "matched", min_seen=0.0)
+
+        def paint(splats):
+            drawn.append(splats)
+            return renderer.paint(splats, view.hw, (0.0, 0.0, 0.0))
+
+        return transmittances(renderer.splats(view), view, 1 / 255, paint)
+
+    assert seen(replace(scene[:40], logit_opacities=torch.full((40,), -3.0))).nanquantile(0.05) > 0.95, "all is seen"
+    found = seen(scene)
+    narrow = seen(scene, replace(view, lens=replace(lens, max_angle=10.0)))
+    assert lens == ORTHO or narrow.isnan().sum() > found.isnan().sum() + 20, "of what the lens does not see"
+    assert all(splats.planes is None for splats in drawn)
+    monkeypatch.setattr("aaplug.core.light.in_image", lambda splats: splats)
+    bent = seen(scene)
+    assert bent.nanquantile(0.1) < 0.6
+    if not lens.distorts or not lens.flat:  # a plane's pixels have the area of the image's
+        assert torch.equal(found.isnan(), bent.isnan())
+        assert (found - bent).abs().nanmean() < 0.003
 
 
 def test_a_lens_ends_where_its_radial_map_turns_back():

@@ -116,12 +116,12 @@ class Lens:
 
         A ray r at the angle θ from the axis and the distance d from it, in the direction u, has the undistorted place
         ρ(θ) u.  Its derivative by x and y is (ρ/d)(1 - u uᵀ) + ρ′ z/|r|² u uᵀ, and by z it is -ρ′ d/|r|² u.
-
-        Raises:
-            UsageError: the lens is equirect.
         """
         if self.projection == "equirect":
-            raise UsageError("lens", "an equirect image, which has a seam, is not linearised")
+            (x, y, z), level, length = rays.unbind(dim=-1), _length(rays[..., ::2]), _length(rays)
+            u = torch.stack([z, torch.zeros_like(y), -x], dim=-1) / level[..., None] ** 2
+            v = torch.stack([-x * y / level, level, -z * y / level], dim=-1) / length[..., None] ** 2
+            return torch.stack([u, v], dim=-2)
         if self.projection == "ortho":
             return rays.new_tensor([[1, 0, 0], [0, 1, 0]]).expand(*rays.shape[:-1], 2, 3)
         across, z, square = _length(rays[..., :2]), rays[..., 2], rays.square().sum(dim=-1) + TINY

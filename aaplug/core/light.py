@@ -21,6 +21,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.exposures import spread_out
+from aaplug.core.sights import plane_rays
 from aaplug.core.splats import Render, Splats2D
 
 # Measured: the least share of a splat's light that counts as seen, from one of the N samples or another, over the cube
@@ -33,8 +34,10 @@ Paint = Callable[[Splats2D], Render]  # draws splats over black
 def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
     """Mean transmittance in front of each splat of a view.
 
-    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.
+    NaN for one that lies in no image or is too faint to be drawn, and for all if `paint` has no gradients.  Through a
+    lens, ellipses of the image stand for splats, because their gradients are compiled.
     """
+    splats = in_image(splats)
     with torch.enable_grad():
         colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
         total = paint(splats.with_columns({"rgb": colours})).rgb[..., 0].sum()
@@ -50,16 +53,30 @@ def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Pa
     return torch.where(shares.isfinite(), shares.clamp(max=1), torch.nan)
 
 
+def in_image(splats: Splats2D) -> Splats2D:
+    """Splats in planes of their own as ellipses of the image: the lens is linearised at each centre.
+
+    One whose centre it does not see has the opacity 0.
+    """
+    camera, planes = splats.camera, splats.planes
+    if camera is None or planes is None:
+        return splats
+    (along, middles), lens = plane_rays(planes), camera.lens
+    by_place = lens.derivatives(middles) @ along * along.new_tensor([[camera.fx], [camera.fy]])
+    covs = by_place @ splats.covs[:, [[0, 1], [1, 2]]] @ by_place.mT
+    dets, seen = splats.dets * torch.linalg.det(by_place).square(), lens.rays(lens.places(middles)).any(dim=1)
+    columns = {"covs": covs.flatten(1)[:, [0, 1, 3]], "dets": dets, "opacities": splats.opacities * seen}
+    return replace(splats, **columns, planes=None, camera=None)
+
+
 def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:
     """Factors of opacity for the splats of a sharp view, if the camera's exposure spreads them without end.
 
-    `spread_out` takes less of them for a splat that is spread less.  Through a lens, ellipses of the image stand for
-    splats, as their gradients are compiled; but not in a panorama, which stretches splats at its poles.
+    `spread_out` takes less of them for a splat that is spread less.
     """
     assert camera.exposure is not None
     least = LEAST_SEEN * camera.exposure.samples ** (1 / 3)
-    drawn = splats if camera.lens.period else replace(splats, planes=None, camera=None)
-    seen = transmittances(drawn, camera, min_alpha, paint)
+    seen = transmittances(splats, camera, min_alpha, paint)
     seen = torch.where(seen.isnan(), seen.nanmean().nan_to_num(1.0), seen).clamp(min=least)
     spread, opacities = spread_out(splats, camera, seen)
     cover = -torch.log1p(-paint(spread).alpha.clamp(max=1.0))

@@ -55,7 +55,8 @@ def project_covariances(
     """The same for Gaussians of any covariance Σ, in squared world units, of which the upper triangle is read.
 
     With T = J W, whose rows have the cross product n, det(T Σ Tᵀ) = nᵀ cof(Σ) n (Cauchy-Binet), in float64.  Through
-    another lens than a pinhole, J is the lens's own at each centre, and the splats are ellipses of the image.
+    another lens than a pinhole, J is the lens's own at each centre, and the splats are ellipses of the image, which end
+    at a panorama's edge.
     """
     if camera.lens == PINHOLE:
         centres, across, down, depths = _linearised(means, *_camera_rows(means, camera, rules))

@@ -52,6 +52,14 @@ def sights(points: Float[Tensor, "n 3"], camera: Camera, near: float = NEAR) -> 
     return Sights(camera.pixels(lens.places(rays)), depths, focal / ahead, planes)
 
 
+def plane_rays(planes: Float[Tensor, "m 3 3"]) -> tuple[Float[Tensor, "m 3 2"], Float[Tensor, "m 3"]]:
+    """A ray's change with each px along the axes of `Splats2D.planes`, and the rays of their middles."""
+    right, down, ahead = planes.unbind(dim=1)
+    columns = [torch.linalg.cross(*pair) for pair in ((down, ahead), (ahead, right), (right, down))]
+    by_x, by_y, middle = (column / (columns[2] * ahead).sum(dim=1, keepdim=True) for column in columns)
+    return torch.stack([by_x, by_y], dim=2), middle
+
+
 def across(rays: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Two unit vectors across each unit ray and each other (Duff et al. 2017, "Building an Orthonormal Basis")."""
     x, y, z = rays.unbind(dim=1)

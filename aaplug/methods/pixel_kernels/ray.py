@@ -19,6 +19,7 @@ from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import Lens
 from aaplug.core.rules import Rules
+from aaplug.core.sights import plane_rays
 from aaplug.core.splats import Splats2D, concatenated
 from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, LOG2_PADDING, exp2_of
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE
@@ -77,11 +78,8 @@ class Ray:
         y = cutoff.sqrt()[:, None] * (
             (xy / long)[:, None] * circle[:, 0] + (splats.dets.sqrt() / long)[:, None] * circle[:, 1]
         )
-        right, down, ahead = planes.unbind(dim=1)
-        columns = [torch.linalg.cross(*pair) for pair in ((down, ahead), (ahead, right), (right, down))]
-        volume = (columns[2] * ahead).sum(dim=1)
-        by_x, by_y, axis = (column[:, None] / volume[:, None, None] for column in columns)
-        rays = axis + x[..., None] * by_x + y[..., None] * by_y
+        (right, _, ahead), (along, middles) = planes.unbind(dim=1), plane_rays(planes)
+        rays = middles[:, None] + torch.stack([x, y], dim=2) @ along.mT
         corners = camera.pixels(lens.places(rays)) - splats.means[:, None]
         turn = camera.fx * lens.period
         if turn:
