@@ -23,6 +23,7 @@ from torch.nn import functional
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels
 from aaplug.core.kernels import Kernel, once_differentiable
 from aaplug.core.runs import starts_of
+from aaplug.core.splats import Render
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows
 from aaplug.rasterizers.tiled.binning import Bins
@@ -47,16 +48,16 @@ from aaplug.rasterizers.tiled.layout import tiles_of
 from aaplug.system.cores import on_free_cores
 
 
-def composite(
-    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing
-) -> tuple[Float[Tensor, "d h w"], Float[Tensor, "h w"]]:
-    """Premultiplied colour, and alpha, of every pixel; differentiable in the raster rows.
+def composite(rows: Float[Tensor, "m c"], bins: Bins, how: Compositing) -> Render:
+    """Colour over the background, and alpha, of every pixel; differentiable in the raster rows.
 
     rows: the last one is the padding row.
     """
     if rows.requires_grad and torch.is_grad_enabled():
-        return _Composite.apply(rows, bins, how)  # pyright: ignore[reportReturnType]
-    return composite_forward(rows, bins, how)
+        rgb, alpha = _Composite.apply(rows, bins, how)  # pyright: ignore[reportGeneralTypeIssues]
+    else:
+        rgb, alpha = composite_forward(rows, bins, how)
+    return Render(rgb.permute(1, 2, 0), alpha)
 
 
 class _Composite(torch.autograd.Function):

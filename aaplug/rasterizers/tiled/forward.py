@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from aaplug.core.colours import BLACK, Colour
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels, ReadsRays
 from aaplug.core.kernels import EAGER, Kernel, Kernels, materialized, where_signed
 from aaplug.core.rules import RULES_3DGS, Rules
@@ -41,6 +42,7 @@ class Compositing:
     """Settings of one frame's compositing.
 
     kernels: run its stages.  channels: of a splat's colour.  rays: of places in px, if the pixel kernel reads them.
+    background: which the colours in raster rows are differences from.
     """
 
     pixel: PixelKernel
@@ -48,6 +50,7 @@ class Compositing:
     kernels: Kernels
     channels: int = 3
     rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]] | None = None
+    background: Colour = BLACK
 
     def rays_of(self, origins: Float[Tensor, "t 2"]) -> list[Float[Tensor, "t P"]]:
         """x, y and z of the rays of these tiles' pixels; none if the pixel kernel reads places."""
@@ -82,14 +85,18 @@ class Segment:
 def composite_forward(
     rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, segments: list[Segment] | None = None
 ) -> tuple[Float[Tensor, "d h w"], Float[Tensor, "h w"]]:
-    """Premultiplied colour, and alpha, of every pixel; appends what the backward pass needs to `segments`.
+    """Colour over the background, and alpha, of every pixel; appends what the backward pass needs to `segments`.
 
     rows: raster rows; the last one is the padding row.
+
+    Over the background b, Σ w c + (1 - Σ w) b equals b + Σ w (c - b): compositing begins with b, at no cost.
     """
     local = how.centres(rows)
     order = bins.by_length()
     filled = max(MIN_TILES, int((bins.counts > 0).sum()))
     planes = rows.new_zeros(how.channels + 1, min(filled + 1, len(order)), PIXELS)  # all empty tiles share the last
+    for plane, value in zip(planes[:-1], how.background, strict=False):
+        plane.fill_(value)
     tiles = order[:filled].tensor_split(-(-filled // how.kernels.tiles)) if len(order) else ()
     done = 0
     for block in tiles:

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
@@ -31,7 +31,7 @@ from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
 from aaplug.system.errors import UsageError
 
-Painter = Callable[[Bins], tuple[Tensor, Tensor]]  # a band's premultiplied colour, three planes, and alpha
+Painter = Callable[[Bins], Render]  # of a band
 MAX_BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
 
 
@@ -74,34 +74,33 @@ class Tiled:
             grid = (1, MIN_TILES)  # a lone tile would be drawn eagerly
         ellipses = pixel.bounding_ellipses(splats, rules) or splats
         if compositor is None:
-            rows = pixel.raster_rows(splats, self.kernels)
             assert splats.rgb is not None
             channels = splats.rgb.shape[1]
+            behind = functional.pad(splats.rgb.new_tensor(background), (0, channels - len(background)))
+            coloured = splats.with_columns({"rgb": splats.rgb - behind}) if any(background) else splats
+            rows = pixel.raster_rows(coloured, self.kernels)
             columns = pixel.columns + channels - 3
             if rows.shape != (len(splats) + 1, columns):
                 expected = f"{len(splats) + 1} rows (one per splat and a padding row) of {columns} columns"
                 problem = f"raster_rows should return {expected}, got {tuple(rows.shape)}"
                 raise UsageError(f"pixel kernel {pixel.name}", problem)
             rays = partial(pixel.rays, splats) if isinstance(pixel, ReadsRays) else None
-            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels, channels, rays))
+            how = Compositing(pixel, rules, self.kernels, channels, rays, background)
+            paint = partial(composite, rows, how=how)
             gradients = rows.requires_grad and torch.is_grad_enabled()
         else:
-            paint, gradients = self._blender(splats, compositor, rules), False
+            paint, gradients = self._blender(splats, compositor, rules, background), False
 
-        def painted() -> Iterator[Render]:
-            for bins in bands(ellipses, grid, self.kernels, self.memory, rules, gradients):
-                rgb, alpha = paint(bins)
-                yield over(rgb.permute(1, 2, 0), alpha, background)
-
-        whole = _assembled(painted(), grid[0] * TILE)
+        parts = map(paint, bands(ellipses, grid, self.kernels, self.memory, rules, gradients))
+        whole = _assembled(parts, grid[0] * TILE)
         return Render(whole.rgb[: hw[0], : hw[1]], whole.alpha[: hw[0], : hw[1]])
 
-    def _blender(self, splats: Splats2D, compositor: Compositor, rules: Rules) -> Painter:
+    def _blender(self, splats: Splats2D, compositor: Compositor, rules: Rules, background: Colour) -> Painter:
         """Paints the tiles of a band by a compositor, tiles with about equally many splats together."""
         rows = compositor.rows(splats)
         local = tile_centres(rows)
 
-        def paint(bins: Bins) -> tuple[Tensor, Tensor]:
+        def paint(bins: Bins) -> Render:
             order = bins.by_length()
             parts = []
             for tiles in order.split(MAX_BLENDED_TILES):
@@ -109,7 +108,7 @@ class Tiled:
                 lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
                 parts.append(compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules))
             image = placed(torch.cat(parts, dim=1).to(splats.means), order, bins.columns, self.kernels)
-            return image[:3], image[3]
+            return over(image[:3].permute(1, 2, 0), image[3], background)
 
         return paint
 
