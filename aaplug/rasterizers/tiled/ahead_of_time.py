@@ -131,6 +131,8 @@ CONTRACTING = "-fno-trapping-math"
 # Inductor's constants come as assembly that does not say whether the stack holds code. Many linkers then ask for an
 # executable stack, which glibc 2.41 refuses to make.
 PLAIN_STACK = "-Wa,--noexecstack"
+# A library's symbols, of inline functions and for debuggers, which nobody reads: half of it.
+FEW_SYMBOLS = "-fvisibility-inlines-hidden -s"
 GNU, CLANG = "Free Software Foundation", "clang version"  # in a compiler's words about itself, whatever its file's name
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
@@ -211,7 +213,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
     target: None for this processor and compiler.  With one, torch's builds for CPUs and for CUDA share the package.
     """
     options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, FOR_PROFILERS, CALLER_LEVEL)
-    options += (SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS, CONTRACTING, PLAIN_STACK)  # of compilers
+    options += (SCHEDULING, MANY_REGISTERS, WHOLE_VECTORS, CONTRACTING, PLAIN_STACK, FEW_SYMBOLS)  # of compilers
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
     version = torch.__version__ if target is None else torch.__version__.partition("+")[0]
     facts = (version, options, *machine, sources_of(kernel))
@@ -531,7 +533,8 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
         capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
         wide = capability == MANY_REGISTERS
         options = SCHEDULING[kernel.keeps_sums or not wide] if GNU in words else CONTRACTING
-        march = f"{target.name if target else THIS_PROCESSOR} {options} {PLAIN_STACK}" + f" {WHOLE_VECTORS}" * wide
+        processor = target.name if target else THIS_PROCESSOR
+        march = " ".join([processor, options, PLAIN_STACK, FEW_SYMBOLS, *[WHOLE_VECTORS] * wide])
         configs |= {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
         where_known |= {TRIED_OUT: True} | ({PRECOMPILES: False} if kernel.keeps_sums and wide else {})
     elif target is not None:
