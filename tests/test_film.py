@@ -12,7 +12,7 @@ import aaplug
 from aaplug import Aperture, CameraSet, Exposure, Render, UsageError, read_camera_path
 from aaplug.core.camera_paths import toward
 from aaplug.core.exposures import FAINT, cells, lattice, opening, sample_cameras, spread, spread_out
-from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, ORTHO, PINHOLE, Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.options.verbs import ImageOptions
@@ -213,6 +213,21 @@ def test_a_spread_splat_has_the_light_that_is_seen_of_it(motion, monkeypatch):
     alone = [psnr(renderer(exposed(opening, motion, count)).rgb, many) for count in (1, 5)]
     assert ours[0] > alone[0] + 3
     assert ours[1] > alone[1] + 1
+
+
+def test_splats_at_a_panoramas_edge_have_the_light_of_its_middle():
+    """Beyond the edge a splat has a copy, whose centre the image does not show."""
+    renderer, ahead = aaplug.Renderer.of(walls(), [VIEW], "matched", min_seen=0.0), []
+    for side in (1.0, -1.0):
+        turn = torch.diag(torch.tensor([side, 1.0, side, 1.0], dtype=torch.float64))
+        panorama = {"lens": EQUIRECT, "fx": 80.0, "fy": 80.0, "cx": 80.0 * math.pi, "cy": 40.0 * math.pi}
+        panorama |= {"width": round(160 * math.pi), "height": round(80 * math.pi)}
+        first, last = (replace(v, cam_from_world=turn @ v.cam_from_world, **panorama) for v in (VIEW, MOVED))
+        ahead.append(renderer._light(replace(first, exposure=Exposure(None, (first, last), 1)), 1))
+    middle, edge = ahead
+    assert middle.quantile(0.1) < 0.2, "some are hidden"
+    assert (middle - edge).abs().max() < 0.4
+    assert (middle - edge).abs().mean() < 0.015
 
 
 def test_a_view_that_shows_nothing_has_an_exposure_too():

@@ -78,6 +78,9 @@ def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> 
     least = LEAST_SEEN * camera.exposure.samples ** (1 / 3)
     seen = transmittances(splats, camera, min_alpha, paint)
     seen = torch.where(seen.isnan(), seen.nanmean().nan_to_num(1.0), seen).clamp(min=least)
+    if (copies := splats.are_copies).any():  # each has its original's
+        shares = seen.new_zeros(int(splats.sources.max()) + 1).index_copy_(0, splats.sources[~copies], seen[~copies])
+        seen = shares[splats.sources]
     spread, opacities = spread_out(splats, camera, seen)
     cover = -torch.log1p(-paint(spread).alpha.clamp(max=1.0))
     x, y = (splats.means.long().clamp(min=0).minimum(splats.sources.new_tensor([camera.width, camera.height]) - 1)).T

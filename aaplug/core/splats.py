@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
@@ -56,6 +56,13 @@ class Splats2D:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    @property
+    def are_copies(self) -> Bool[Tensor, " m"]:
+        """True for copies of splats that cross a panorama's edge: they lie more than half a turn from its middle."""
+        if self.camera is None or not self.camera.lens.period:
+            return torch.zeros_like(self.sources, dtype=torch.bool)
+        return (self.means[:, 0] - self.camera.cx).abs() > self.camera.fx * self.camera.lens.period / 2
 
     @contract
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":

@@ -463,8 +463,8 @@ class Renderer:
             samples = 1
         splats, paint = self.splats(replace(small, exposure=None), samples), partial(self.paint, hw=small.hw)
         found = lights(splats, small, self.training.convention.rules.min_alpha, partial(paint, background=BLACK))
-        beside = float(found.mean().nan_to_num(1.0))
-        return found.new_full((len(self.scene),), beside).index_copy_(0, splats.sources, found)
+        beside, originals = float(found.mean().nan_to_num(1.0)), ~splats.are_copies
+        return found.new_full((len(self.scene),), beside).index_copy_(0, splats.sources[originals], found[originals])
 
     def _projected(
         self,

@@ -151,9 +151,7 @@ class Ray:
         right, down, ahead = torch.einsum("mij,pmj->ipm", _planes(splats), rays)
         place = torch.stack([right, down], dim=2) / ahead.clamp(min=MIN_AHEAD)[..., None]
         white = torch.einsum("mij,pmj->pmi", whitening(splats), place)
-        seen = rays.square().sum(dim=2) > 0
-        if splats.camera is not None and splats.camera.lens.period:  # copies are for the tiles alone
-            seen &= (splats.means[:, 0] - splats.camera.cx).abs() <= splats.camera.fx * splats.camera.lens.period / 2
+        seen = (rays.square().sum(dim=2) > 0) & ~splats.are_copies  # which are for the tiles alone
         return torch.exp(-0.5 * white.square().sum(dim=2)) * seen
 
 
