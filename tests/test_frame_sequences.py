@@ -59,7 +59,7 @@ def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):
     for number in (2, 5):
         Path(f"out/f.{number:04d}.png").unlink()
     cli.refused(words, "already holds f.0001.png", "or --resume to go on")
-    cli.done(f"{words} --resume")
+    assert "resumed with 4 of 6 frames" in cli.done(f"{words} --resume")[1]
     assert bytes_of("out") == whole
     again = {path.name for path in Path("out").iterdir() if path.stat().st_mtime_ns != times[path.name]}
     assert again == {"f.0002.png", "f.0005.png"}
@@ -114,7 +114,8 @@ REFUSED = {
     "v.mp4 --format exr": f"--format: {VIDEO}",
     "v.mp4 --lens fisheye": "--lens: fisheye sets its own angle, which zoom would change; give --path dolly or orbit",
     "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",
-    "##/a.png": "name a .webm or .mp4 file",
+    "##/a.png": "a.png: has a frame's number in a folder's name; give it to the file alone",
+    "a.####/b.####.png": "b.####.png: has a frame's number in a folder's name",
     "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",
     "a.##.png --beside mip": "--beside: is for videos of one eye; a frame sequence and vr180 show --recipe alone",
     "a.##.png --passes depth": "--passes: a .png cannot hold depth",

@@ -18,7 +18,7 @@ from aaplug.system.errors import START_AGAIN, FormatError, OutputError, counted,
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif", *CODECS)  # any other name is a folder
 DEVICE = re.compile("con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)  # no file on Windows, whatever its suffix
-PLACES = re.compile("#+")  # of a frame's number in a name
+PLACES, SEVERAL = re.compile("#+"), "##"  # of a frame's number in a name; one # may be part of a name
 SEPARATORS = "._-"  # between it and the rest
 USUAL_NAME = "frame.####"  # in a folder
 LONGEST_NAME = 200  # bytes to which names are cut; file systems take 255, and a number and a suffix are added
@@ -32,7 +32,7 @@ def names_image(output: Path) -> bool:
 def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: str = ".png") -> list[Path]:
     """One file per view in the folder `output`, or `output` itself if it names one image; raises OutputError."""
     if names_image(output):
-        if "##" in output.name:
+        if SEVERAL in output.name:
             raise OutputError(output, "names a frame sequence, which `video` writes; name a folder, or one image")
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
             one = f"one {', '.join(SUFFIXES)} for one image"
@@ -72,8 +72,11 @@ class FrameSequence:
     def of(cls, output: Path, format: str | None) -> "FrameSequence | None":
         """The sequence that an output names, or that a format asks for in a folder; else None.
 
-        Raises OutputError if the name has places for more than one number, or is that of no format.
+        Raises OutputError if the name has places for more than one number or is that of no format, and for places in
+        a folder's name.
         """
+        if SEVERAL in str(output.parent):
+            raise OutputError(output, "has a frame's number in a folder's name; give it to the file alone")
         if not PLACES.search(output.name):
             return None if format is None or names_image(output) else cls(output / f"{USUAL_NAME}.{format}")
         if len(PLACES.findall(output.name)) > 1:

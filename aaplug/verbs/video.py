@@ -125,6 +125,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
 
             if sequence is not None:
                 left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
+                if options.resume:
+                    job.monitor.say(f"resumed with {len(views) - len(left)} of {counted(len(views), 'frame')}")
                 paths, cameras_left = [sequence.paths[place] for place in left], [views[place] for place in left]
                 tell_left = tell_after(len(views) - len(left))
                 write_frames(renderers[0], cameras_left, paths, workers.pool.map, storage=storage, tell=tell_left)
