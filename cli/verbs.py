@@ -91,7 +91,7 @@ def convert(words: Words) -> Answer:
     inputs = read_inputs(words)
     result = aaplug.convert(*inputs, words.output, **told(words, verbs.ConvertOptions))
     from aaplug.evaluation.results import tables
-    from aaplug.io.scenes import written_format
+    from aaplug.io.scenes import kind_written, written_format
     from aaplug.methods.conversion import described_fusions
 
     format = written_format(words.output)  # None for a folder of frames, which are .ply
@@ -99,8 +99,8 @@ def convert(words: Words) -> Answer:
     if result.scene is not None:
         how = f"fused {described_fusions(result.scene.fused)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
-    kind = "ply" if format is None else getattr(format, "read_as", None) or format.name
-    say(result.viewer.advice(kind, words.output.name))
+    if advice := result.viewer.advice(kind_written(words.output), words.output.name):
+        say(advice)
     title = "As the viewer draws it, against the scene's own training-size render:"
     shown = [] if result.report is None else [title, tables(result.report)[0]]
     return Answer({"output": str(words.output)} | result.as_json(), shown)

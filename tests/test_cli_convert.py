@@ -90,10 +90,10 @@ def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention
 
 
 def test_convert_says_before_its_work_that_no_viewer_opens_the_format(cli):
-    _, err = cli.done("convert scene.ply --cameras . -o c.splat --for supersplat --steps 0")
-    told = "no viewer of this rule is known to open c.splat; --for babylon writes one that Babylon.js"
+    _, err = cli.done(f"{CONVERT} --for cesium --steps 0")
+    told = "no viewer of this rule is known to open c.ply; write a .glb or .spz.glb, or --for"
     assert " ".join(err.split()).count(told) == 1
-    assert err.index("no viewer") < err.index("measuring") < err.index("wrote c.splat")
+    assert err.index("no viewer") < err.index("measuring") < err.index("wrote c.ply")
 
 
 def test_convert_for_a_viewer_prints_the_residual_as_json(cli, monkeypatch):

@@ -139,8 +139,8 @@ def test_discs_are_smoothed_within_their_planes_and_stay_discs(cameras, tmp_path
 
 
 def test_a_format_that_no_viewer_opens_is_told():
-    assert VIEWERS["mip"].advice("balls", "scene.balls") == "no viewer is known to open scene.balls"
-    assert DISC_VIEWER.advice("sog", "discs.sog") == "no viewer is known to open discs.sog"  # as discs
+    assert VIEWERS["mip"].caveat("balls", "scene.balls") == "no viewer is known to open scene.balls"
+    assert DISC_VIEWER.caveat("sog", "discs.sog") == "no viewer is known to open discs.sog"  # as discs
 
 
 WHITE = (1.0, 1.0, 1.0)

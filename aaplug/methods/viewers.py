@@ -97,21 +97,27 @@ class Viewer:
         """The settings, after the switch that they need."""
         return f"anti-aliasing on: {self.settings}" if self.switched else self.settings
 
+    def caveat(self, suffix: str, file: str) -> str:
+        """One line, where no viewer of this rule is known to open a file of such a format; else nothing."""
+        if suffix in self.formats or self._others(suffix):
+            return ""
+        fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
+        if not fitting or self == DISC_VIEWER:  # the others show no discs
+            return f"no viewer is known to open {file}"
+        own = " or ".join(f".{name}" for name in self.formats)
+        hint = f"write a {own}, or --for {listing(fitting)} writes one for its own rule"
+        if others := self._others(suffix, alike=False):
+            hint = f"--for {others[0].name} writes one that {others[0].program} opens"
+        return f"no viewer of this rule is known to open {file}; {hint}"
+
     def advice(self, suffix: str, file: str) -> str:
-        """One line on the settings to choose in the program for a file, of such a format, that was converted for it."""
+        """One line on the settings to choose in the program for a file, of such a format, that was converted for it.
+
+        Nothing where no viewer is known to open it.
+        """
         if suffix not in self.formats:
-            others = [v for v in VIEWERS.values() if suffix in v.formats and v.convention == self.convention]
-            alike = [v for v in others if suffix != "spz" or v.spz("auto") == self.spz("auto")]
-            if alike:
-                return f"open {file} in " + " or ".join(f"{v.program} ({v.settings})" for v in alike)
-            fitting = [viewer.name for viewer in VIEWERS.values() if suffix in viewer.formats]
-            if not fitting or self == DISC_VIEWER:  # the others show no discs
-                return f"no viewer is known to open {file}"
-            own = " or ".join(f".{name}" for name in self.formats)
-            hint = f"write a {own}, or --for {listing(fitting)} writes one for its own rule"
-            if others:
-                hint = f"--for {others[0].name} writes one that {others[0].program} opens"
-            return f"no viewer of this rule is known to open {file}; {hint}"
+            others = " or ".join(f"{v.program} ({v.settings})" for v in self._others(suffix))
+            return others and f"open {file} in {others}"
         nothing, _, why = self.settings.partition(": ")
         if nothing in ("nothing", "none"):
             return f"in {self.program}, there is nothing to choose" + (f": {why}" if why else "")
@@ -119,6 +125,11 @@ class Viewer:
             return f"in {self.program}, choose {self.settings}"
         without = "with it off, a converted scene can look worse than the original"
         return f"in {self.program}, turn {self.choice} ({without})"
+
+    def _others(self, suffix: str, alike: bool = True) -> "list[Viewer]":
+        """Viewers of this rule that open the format; alike: that take a .spz as this one does."""
+        others = [v for v in VIEWERS.values() if suffix in v.formats and v.convention == self.convention]
+        return [v for v in others if suffix != "spz" or not alike or v.spz("auto") == self.spz("auto")]
 
     def spz(self, asked: SpzAxes) -> "dict[str, Any]":
         """How a .spz is written, for `write_scene`: axes as asked for, or the program's own, and its version."""

@@ -16,7 +16,7 @@ from aaplug.evaluation.coverage import check_frame_of
 from aaplug.evaluation.results import Report, results
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
-from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
+from aaplug.io.scenes import SceneLike, check_scene_output, kind_written, write_parts, write_scene, written_format
 from aaplug.io.scenes.scene import PART, Scene
 from aaplug.methods.conversion import FORMS, Form, blurring, fuse
 from aaplug.methods.filters.smoothing import Smoothing3D
@@ -95,6 +95,8 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
             check_scene_output(path, options.overwrite, job.scene.files)
 
     check()
+    if path is not None and (caveat := viewer.caveat(kind_written(path), path.name)):
+        job.monitor.say(caveat)
     with running(options, path, check, job.inputs, folder=frames is not None) as workers:
         report = None
         if isinstance(rule, Viewer):

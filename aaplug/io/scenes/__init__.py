@@ -247,6 +247,12 @@ def written_format(path: AnyPath) -> WritableFormat | None:
     return found if isinstance(found, WritableFormat) else None
 
 
+def kind_written(path: AnyPath) -> str:
+    """Name of the format that `path` will be read as; ply for a folder of frames."""
+    format = written_format(path)
+    return "ply" if format is None else getattr(format, "read_as", None) or format.name
+
+
 def _ending(format: SceneFormat) -> str:
     """The end of its files' names: a suffix, or such as meta.json the whole name."""
     return format.name if format.name.endswith(".json") else f".{format.name}"
