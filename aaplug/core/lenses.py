@@ -31,6 +31,7 @@ MIN_SLOPE = 0.05  # of the radial map: where it is flatter, the lens ends
 RADII = 4096  # at which the radial map is tabulated
 NEWTON_STEPS = 6  # which double the digits of a tabulated start
 TINY = 1e-30  # squared length below which a vector has no direction
+NEWTON_TOLERANCE = 1e-9  # focal lengths, of a step after which none is needed
 PLACE_TOLERANCE = 1e-5  # focal lengths between a place and that of the ray found for it
 
 
@@ -198,7 +199,10 @@ class Lens:
         for _ in range(NEWTON_STEPS):
             mapped_to, (a, b, c, d) = self._brown(plane)
             u, v = (mapped_to - wanted).unbind(dim=-1)
-            plane = plane - torch.stack([d * u - b * v, a * v - c * u], dim=-1) / (a * d - b * c)[..., None]
+            step = torch.stack([d * u - b * v, a * v - c * u], dim=-1) / (a * d - b * c)[..., None]
+            plane = plane - step
+            if (step.abs() <= NEWTON_TOLERANCE).all():  # the next step would be its square
+                break
         error = _length(self._distorted(plane) - wanted)
         inside = (error <= PLACE_TOLERANCE) & (_length(plane) <= end)
         return plane.to(places), inside
