@@ -14,6 +14,7 @@ from aaplug import RASTERIZERS, RECIPES, VIEWERS, Camera, CameraSet, TrainingVie
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.imaging import quantised
+from aaplug.core.lenses import PINHOLE, opencv_lens
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.metrics import PSNR, psnr
@@ -23,6 +24,7 @@ from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.fitting import fit
 from aaplug.finetuning.loop import advance, extent, least_log_scales, loss_at, run
 from aaplug.finetuning.poses import moved_by, refine_pose
+from aaplug.finetuning.refining import refine
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, RATES, Settings, balance, l2, slowed
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, between, leaves_of, load, save, scene_of
 from aaplug.lab import mipmap_gs
@@ -34,6 +36,7 @@ from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.cores import FREE_CORES
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import torch_threads
+from aaplug.system.monitor import SILENT
 from tests.conftest import make_camera, make_scene, moved, run_python, with_photographs
 from tests.test_announce import Heard
 
@@ -70,6 +73,20 @@ def test_the_number_of_threads_plays_no_part(monkeypatch):
     one, two = states
     assert one.curve == two.curve
     assert all(torch.equal(leaf, two.leaves[name]) for name, leaf in one.leaves.items())
+
+
+def test_tuning_draws_straight_views(monkeypatch):
+    """Gradients through a lens are not compiled, and viewers draw pinholes."""
+    bent, lenses, splats = [replace(view, lens=opencv_lens((-0.1,))) for view in VIEWS], [], Renderer.splats
+    monkeypatch.setattr(Renderer, "splats", lambda self, view, *a: lenses.append(view.lens) or splats(self, view, *a))
+    scene = make_scene(30)
+    look = own_look(scene, TrainingViews.of(scene, bent), RASTERIZERS["eager"], GREY)
+    fit(scene, VIEWERS["mip"], look, bent, 1)
+    refine(scene, 0.5, look, bent, 1, None, SILENT, ())
+    assert {*lenses} == {PINHOLE}
+    lenses.clear()
+    finetune(scene, CameraSet(tuple(bent), tuple(bent[:1])), None, steps=1, min_seen=0.0)
+    assert {*lenses} == {PINHOLE, bent[0].lens}, "steps and measurements"
 
 
 def test_steps_draw_by_several_rules_in_turn(monkeypatch):

@@ -185,6 +185,10 @@ class Camera:
         """This view, declared to be a pose of the data set at its training size."""
         return replace(self, trained_focal=self.focal)
 
+    def straight(self) -> "Camera":
+        """This view as a pinhole of the same focal lengths if its lens is a pinhole that distorts, else unchanged."""
+        return replace(self, lens=PINHOLE) if self.lens.projection == PINHOLE.projection else self
+
     def _moved(self, width: int, height: int, x: float, y: float, at: Point = CORNER, to: Point = CORNER) -> "Camera":
         """Another image, of pixels x and y times as dense, in which the place `at` of this one, in px, is at `to`."""
         lens = {"fx": self.fx * x, "fy": self.fy * y}

@@ -39,10 +39,11 @@ def fit(
     """A scene for a viewer, and original, closed form and result as it shows them; raises as `fuse_for` and `tune` do.
 
     look: draws the scene as training showed it, which the viewer should show.
-    views: to measure on; a few of them are taken.
+    views: to measure on; a few of them are taken.  These and the training views are straight, as viewers draw them.
     steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
+    views, train = ([view.straight() for view in each] for each in (spread(views, MAX_VIEWS), look.training.cameras))
     original = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
     recipes = {"": original.recipe}  # by what they add to the names of rows
     recipes |= {f" in {VIEWERS[name].program}": recipe_of(VIEWERS[name]) for name in viewer.shown_by}
@@ -50,7 +51,7 @@ def fit(
     def measure(renderers: Mapping[str, Renderer]) -> Report:
         rows = {name + by: replace(r, recipe=recipe) for by, recipe in recipes.items() for name, r in renderers.items()}
         with monitor.progress("measuring", "views") as tell:
-            task = Task(rows, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
+            task = Task(rows, (1.0, *QUICK_SETTINGS.weights), views, truth, ceiling=False)
             return evaluate(task, tell=tell)
 
     def as_converted(name: str) -> Report:
@@ -82,7 +83,7 @@ def fit(
     usual = SHARED_SETTINGS if viewer.shown_by else QUICK_SETTINGS
     settings = balance(replace(usual, steps=steps), errors_of(before, ORIGINAL))
     slow = slowed(settings, errors_of(before, start))
-    job = TuningJob(renderers[start], original.training.cameras, truth, slow, recipes=[*recipes.values()])
+    job = TuningJob(renderers[start], train, truth, slow, recipes=[*recipes.values()])
     state = tune(job, monitor=monitor)
     tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
     report = report_of(result) if steps else as_converted(CLOSED_FORM)

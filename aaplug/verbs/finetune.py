@@ -107,7 +107,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         if options.poses:
             job = replace(job, cameras=refined(look, job.cameras, job.cameras.all, job.monitor)[0])
             look = job.second_look(look)
-        train = job.cameras.train
+        train = job.cameras.train if photographs else tuple(view.straight() for view in job.cameras.train)
         before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
         fused = fuse_for(raw, look.training, viewer)
         if isinstance(screen := before.recipe.screen, ReadsColumns):
