@@ -287,6 +287,20 @@ def test_tiles_draw_through_a_lens_what_the_reference_does(lens):
         assert error.mean() < 1e-6, name
 
 
+def test_bounds_are_found_once_and_forgotten_where_splats_change(lens, monkeypatch):
+    renderer = Renderer.of(make_scene(60), [view_through(lens)], "matched", min_seen=0.0)
+    splats = renderer.splats(view_through(lens))
+    again = RAY.bounding_ellipses(replace(splats, reach=None), RULES_3DGS)
+    assert splats.bounds is not None
+    for name in ("means", "covs", "dets", "opacities"):
+        torch.testing.assert_close(getattr(splats.bounds, name), getattr(again, name), rtol=1e-4, atol=1e-3)
+    assert torch.equal(splats[3:7].bounds.covs, splats.bounds.covs[3:7])
+    assert splats.with_columns({"rgb": 2 * splats.rgb}).bounds is not None
+    assert splats.blurred(0.1, compensate=True).bounds is None
+    monkeypatch.setattr(type(RAY), "bounding_ellipses", lambda *_: pytest.fail("a second time"))
+    renderer.paint(splats, (64, 64))
+
+
 def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
     camera = view_through(lens, side=96)
     scene, sizes = make_scene(200, dtype=torch.float64), torch.linspace(-5.0, 1.0, 200, dtype=torch.float64)[:, None]

@@ -66,7 +66,7 @@ def in_image(splats: Splats2D) -> Splats2D:
     covs = by_place @ splats.covs[:, [[0, 1], [1, 2]]] @ by_place.mT
     dets, seen = splats.dets * torch.linalg.det(by_place).square(), lens.rays(lens.places(middles)).any(dim=1)
     columns = {"covs": covs.flatten(1)[:, [0, 1, 3]], "dets": dets, "opacities": splats.opacities * seen}
-    return replace(splats, **columns, planes=None, camera=None)
+    return replace(splats.with_columns(columns), planes=None, camera=None)
 
 
 def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> Float[Tensor, " m"]:

@@ -19,6 +19,7 @@ from aaplug.system.errors import UsageError
 
 MIN_COMPENSATION = 0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS)
 NEARER, FARTHER = 0.25, 0.12  # shares of the change of depth along a ray that count where it is negative, or positive
+SHAPE = frozenset(("covs", "dets", "opacities"))  # columns that decide what bounds a splat
 Floor = Annotated[float, Range(0, 1)]
 
 
@@ -35,6 +36,8 @@ class Splats2D:
     planes: of the plane in which each splat is a Gaussian of covariance `covs`: axes in the camera's frame that point
         right, down and ahead.  A ray d meets the plane right·d / ahead·d and down·d / ahead·d px from the centre.
     rates: at which the view samples each splat, in px per world unit.
+    reach: x and y of the centre from the splat's own, packed covariance, determinant and opacity of the ellipse that
+        bounds it, where a pixel kernel shows more than the splat's own; culling adds it.  See `bounds`.
     """
 
     means: Float[Tensor, "m 2"]
@@ -49,6 +52,7 @@ class Splats2D:
     window: float = 1.0
     planes: Float[Tensor, "m 3 3"] | None = None
     rates: Float[Tensor, " m"] | None = None
+    reach: Float[Tensor, "m 7"] | None = None
     camera: Camera | None = None
 
     def __post_init__(self) -> None:
@@ -63,6 +67,14 @@ class Splats2D:
         if self.camera is None or not self.camera.lens.period:
             return torch.zeros_like(self.sources, dtype=torch.bool)
         return (self.means[:, 0] - self.camera.cx).abs() > self.camera.fx * self.camera.lens.period / 2
+
+    @property
+    def bounds(self) -> "Splats2D | None":
+        """The bounding ellipses that culling found; None if it found none, or the splats have changed since."""
+        if self.reach is None:
+            return None
+        means, covs, (dets, opacities) = self.reach[:, :2], self.reach[:, 2:5], self.reach[:, 5:].unbind(dim=1)
+        return self.with_columns({"means": self.means + means, "covs": covs, "dets": dets, "opacities": opacities})
 
     @contract
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":
@@ -125,8 +137,8 @@ class Splats2D:
 
     def with_columns(self, columns: dict[str, Tensor]) -> "Splats2D":
         """The same with other columns, which come from columns that were checked and so are not checked again."""
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), **columns)
+        other, known = object.__new__(type(self)), SHAPE.isdisjoint(columns) or "reach" in columns
+        vars(other).update(vars(self), **({} if known else {"reach": None}), **columns)
         return other
 
     def _columns(self) -> dict[str, Tensor]:

@@ -79,7 +79,8 @@ class Ray:
             (xy / long)[:, None] * circle[:, 0] + (splats.dets.sqrt() / long)[:, None] * circle[:, 1]
         )
         (right, _, ahead), (along, middles) = planes.unbind(dim=1), plane_rays(planes)
-        rays = middles[:, None] + torch.stack([x, y], dim=2) @ along.mT
+        by_x, by_y = along[:, None].unbind(dim=3)
+        rays = middles[:, None] + x[..., None] * by_x + y[..., None] * by_y
         corners = camera.pixels(lens.places(rays)) - splats.means[:, None]
         turn = camera.fx * lens.period
         if turn:
@@ -173,7 +174,7 @@ def with_copies(splats: Splats2D, rules: Rules) -> Splats2D:
     if camera is None or not camera.lens.period:
         return splats
     turn = camera.fx * camera.lens.period
-    ellipses, parts = RAY.bounding_ellipses(splats, rules), [splats]
+    ellipses, parts = splats.bounds or RAY.bounding_ellipses(splats, rules), [splats]
     assert ellipses is not None
     cutoff = squared_cutoff(ellipses.opacities, rules.min_alpha).clamp(min=0)
     half = (cutoff * ellipses.covs[:, 0]).sqrt()
