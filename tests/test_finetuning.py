@@ -520,6 +520,22 @@ def test_poses_that_are_off_come_back_and_right_ones_stay(photographed):
     assert (second.degrees, second.distance, second.after) == (0.0, 0.0, second.before)
 
 
+@pytest.mark.parametrize(
+    "lens", [opencv_lens((-0.2, 0.05)), opencv_lens((0.05,), fisheye=True)], ids=["barrel", "fisheye"]
+)
+def test_poses_of_bent_photographs_come_back(photographed, lens, tmp_path, monkeypatch):
+    """Of a pinhole's by straightened ones, because gradients through a lens are not compiled."""
+    scene, cameras = photographed
+    bent, search, tried = replace(cameras.train[0], lens=lens), refine_pose, []
+    right = with_photographs(Renderer.of(scene, cameras, "matched", min_seen=0.0), [bent], tmp_path)
+    monkeypatch.setattr("aaplug.finetuning.poses.refine_pose", lambda r, view: tried.append(view) or search(r, view))
+    off = CameraSet(tuple(moved_by(view, CHANGE, DEPTH) for view in right.train), ())
+    found, _ = aaplug.refine_poses(scene, off, min_seen=0.0)
+    assert [view.lens for view in tried] == [PINHOLE if lens.flat else lens]
+    assert found.train == (replace(right.train[0], cam_from_world=found.train[0].cam_from_world),)
+    assert apart(found.train[0], bent)[0] < apart(off.train[0], bent)[0] / 4
+
+
 def test_coarse_scales_lead_farther_than_fine_ones(photographed):
     scene, cameras = photographed
     renderer = Renderer.of(scene, cameras, min_seen=0.0)

@@ -187,7 +187,7 @@ class Camera:
 
     def straight(self) -> "Camera":
         """This view as a pinhole of the same focal lengths if its lens is a pinhole that distorts, else unchanged."""
-        return replace(self, lens=PINHOLE) if self.lens.projection == PINHOLE.projection else self
+        return replace(self, lens=PINHOLE) if self.lens.flat and self.lens.distorts else self
 
     def _moved(self, width: int, height: int, x: float, y: float, at: Point = CORNER, to: Point = CORNER) -> "Camera":
         """Another image, of pixels x and y times as dense, in which the place `at` of this one, in px, is at `to`."""

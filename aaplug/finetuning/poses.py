@@ -18,6 +18,7 @@ from torch import Tensor
 from aaplug.core.camera_paths import median_depth
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.finetuning.settings import l2
+from aaplug.io.lenses import straightened
 from aaplug.io.photographs import photo_of
 from aaplug.methods.presets import find_recipe
 from aaplug.rendering.renderer import Renderer
@@ -60,7 +61,10 @@ def refined(
     with monitor.progress("refining poses", "views") as tell:
         for done, view in enumerate(views):
             tell(done, len(views))
-            poses.append(refine_pose(renderer, view))
+            # Gradients through a lens are not compiled. Through a fisheye splats differ too much from a pinhole's.
+            straight = straightened(view, view.lens) if view.straight() is not view else view
+            pose = refine_pose(renderer, view if straight.photo is None else straight)
+            poses.append(replace(pose, camera=replace(view, cam_from_world=pose.camera.cam_from_world)))
     moved = {id(view): pose.camera for view, pose in zip(views, poses, strict=True)}
     splits = {s: tuple(moved.get(id(v), v) for v in vars(cameras)[s]) for s in ("train", "test")}
     changed = [(p.degrees, p.distance, p.before, p.after) for p in poses if p.after < p.before]

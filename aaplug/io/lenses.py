@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.cameras import Camera, Undistortion
-from aaplug.core.lenses import EQUIRECT, Lens
+from aaplug.core.lenses import EQUIRECT, PINHOLE, Lens
 from aaplug.system.errors import UsageError, counted
 
 HALF_PIXEL = 0.5  # px: the centre of OpenCV's first pixel is 0
@@ -57,7 +57,7 @@ def with_lenses(
                 problem = f"its photograph is a panorama ({distortion.name}), which no pinhole shows"
                 raise UsageError(f"camera {camera.name}", f"{problem}; leave out `undistort`")
             if undistort:
-                camera, what = _straightened(camera, lens), STRAIGHTENED
+                camera, what = straightened(camera, lens), STRAIGHTENED
             else:
                 camera = replace(camera, **({"lens": lens} if lens else {"photo": None}))
             unused = lens is None or (undistort and camera.photo is None)
@@ -69,16 +69,16 @@ def with_lenses(
     ]
 
 
-def _straightened(camera: Camera, lens: Lens | None) -> Camera:
-    """The pinhole of a camera whose photograph was taken by a lens, without it if it cannot be used."""
+def straightened(camera: Camera, lens: Lens | None) -> Camera:
+    """The pinhole of a camera whose photograph was taken by a lens, without the photograph if it cannot be used."""
     if camera.photo is not None and lens is not None:
         size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
         whole = Undistortion(lens, size, pinhole, (0, 0, *size))
         if window := _window(whole):
             left, top, width, height = window
             placed = {"width": width, "height": height, "cx": camera.cx - left, "cy": camera.cy - top}
-            return replace(camera, **placed, undistortion=replace(whole, window=window))
-    return replace(camera, photo=None)
+            return replace(camera, **placed, lens=PINHOLE, undistortion=replace(whole, window=window))
+    return replace(camera, lens=PINHOLE, photo=None)
 
 
 def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None) -> Float[Tensor, "H W c"]:
