@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 from importlib.util import find_spec
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 
 import pytest
@@ -130,9 +130,9 @@ def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatc
 
 
 def test_frames_of_different_sizes_and_sequences_of_render_are_refused(cli, monkeypatch):
-    for views in ("r_1", "test"):
-        said = "f.####.png: names a frame sequence, which `video` writes; name a folder, or one image"
-        cli.refused(f"render scene.ply --cameras . --views {views} -o f.####.png", said)
+    for views, name in product(("r_1", "test"), ("f.####.png", "####")):
+        said = f"{name}: names a frame sequence, which `video` writes; name a folder, or one image"
+        cli.refused(f"render scene.ply --cameras . --views {views} -o {name}", said)
     path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
     monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _, fps: path)
     Path("path.json").touch()

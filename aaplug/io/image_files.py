@@ -31,9 +31,9 @@ def names_image(output: Path) -> bool:
 
 def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: str = ".png") -> list[Path]:
     """One file per view in the folder `output`, or `output` itself if it names one image; raises OutputError."""
+    if SEVERAL in output.name:
+        raise OutputError(output, "names a frame sequence, which `video` writes; name a folder, or one image")
     if names_image(output):
-        if SEVERAL in output.name:
-            raise OutputError(output, "names a frame sequence, which `video` writes; name a folder, or one image")
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
             one = f"one {', '.join(SUFFIXES)} for one image"
             raise OutputError(output, f"name a folder, or {one} ({counted(len(views), 'image')} asked for)")

@@ -60,6 +60,7 @@ GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients a
 KEPT_RATES = 1 << 12  # free cameras whose rates a renderer remembers
 LIGHT_PIXELS = 1 << 16  # of the view in which the light of an exposure's splats is looked up; fewer take no less time
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
+STRAIGHTENS = "`undistort` straightens cameras that distort"
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
 
@@ -333,10 +334,10 @@ class Renderer:
         if camera is None or camera.lens == PINHOLE:
             return self.recipe
         if self.recipe.order == "tile":
-            raise UsageError("order", "tile is for pinhole views; depth draws all")
+            raise UsageError("order", f"tile is for pinhole views; depth draws all, and {STRAIGHTENS}")
         if self.recipe.pixel != POINT or self.recipe.compositor is not None:
             problem = f"recipe {self.recipe.name} draws pinhole views only"
-            raise UsageError("lens", f"{problem}; auto, matched, classic, ewa and mip draw all")
+            raise UsageError("lens", f"{problem}; auto, matched, classic, ewa and mip draw all, and {STRAIGHTENS}")
         return replace(self.recipe, pixel=RAY)
 
     @contract
