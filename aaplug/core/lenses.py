@@ -162,18 +162,24 @@ class Lens:
         return rays.where(cosine >= math.cos(math.radians(self.max_angle)), 0.0)
 
     def _distorted(self, plane: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-        return self._brown(plane)[0] if self.distorts else plane
+        return self._brown(plane, derive=False)[0] if self.distorts else plane
 
-    def _brown(self, plane: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], tuple[Tensor, ...]]:
-        """Distorted places, and their derivatives: of x by x and y, then of y."""
+    def _brown(
+        self, plane: Float[Tensor, "*n 2"], derive: bool = True
+    ) -> tuple[Float[Tensor, "*n 2"], tuple[Tensor, ...]]:
+        """Distorted places, and their derivatives if these are asked for: of x by x and y, then of y."""
         end, slope = self._end
         outside = (_length(plane) / end).clamp(min=1)[..., None]
         x, y = (plane / outside).unbind(dim=-1)
         square, (p1, p2), (s1, s2, s3, s4) = x * x + y * y, self.tangential, self.prism
         (above, d_above), (below, d_below) = (_series(c, square) for c in (self.radial, self.rational))
-        scale, d_scale = above / below, (d_above * below - above * d_below) / below**2
+        scale = above / below
         u = x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x) + s1 * square + s2 * square * square
         v = y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y + s3 * square + s4 * square * square
+        places = torch.stack([u, v], dim=-1) + slope * (plane - plane / outside)
+        if not derive:
+            return places, ()
+        d_scale = (d_above * below - above * d_below) / below**2
         by_square = 2 * (s1 + 2 * s2 * square), 2 * (s3 + 2 * s4 * square)
         both = 2 * (x * y * d_scale + p1 * x + p2 * y)
         derivatives = (
@@ -182,7 +188,7 @@ class Lens:
             both + x * by_square[1],
             scale + 2 * y * y * d_scale + 6 * p1 * y + 2 * p2 * x + y * by_square[1],
         )
-        return torch.stack([u, v], dim=-1) + slope * (plane - plane / outside), derivatives
+        return places, derivatives
 
     def _undistorted(self, places: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Tensor]:
         """Undistorted places, and where there are any; by Newton's method from the inverse of the radial map."""
