@@ -18,6 +18,7 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.options.verbs import ImageOptions
 from aaplug.rasterizers.tiled.rasterizer import EAGER_TILED
 from aaplug.rendering.film import filmed
+from aaplug.rendering.visibility import visibility
 from aaplug.verbs.render import description
 from tests.conftest import make_camera, make_scene
 from tests.test_camera_paths import document
@@ -217,14 +218,16 @@ def test_a_spread_splat_has_the_light_that_is_seen_of_it(motion, monkeypatch):
 
 def test_splats_at_a_panoramas_edge_have_the_light_of_its_middle():
     """Beyond the edge a splat has a copy, whose centre the image does not show."""
-    renderer, ahead = aaplug.Renderer.of(walls(), [VIEW], "matched", min_seen=0.0), []
+    renderer, ahead, seen = aaplug.Renderer.of(walls(), [VIEW], "matched", min_seen=0.0), [], []
     for side in (1.0, -1.0):
         turn = torch.diag(torch.tensor([side, 1.0, side, 1.0], dtype=torch.float64))
         panorama = {"lens": EQUIRECT, "fx": 80.0, "fy": 80.0, "cx": 80.0 * math.pi, "cy": 40.0 * math.pi}
         panorama |= {"width": round(160 * math.pi), "height": round(80 * math.pi)}
         first, last = (replace(v, cam_from_world=turn @ v.cam_from_world, **panorama) for v in (VIEW, MOVED))
         ahead.append(renderer._light(replace(first, exposure=Exposure(None, (first, last), 1)), 1))
+        seen.append(visibility(renderer, [first], 1.0))
     middle, edge = ahead
+    assert torch.equal(*(each.isnan() for each in seen))
     assert middle.quantile(0.1) < 0.2, "some are hidden"
     assert (middle - edge).abs().max() < 0.4
     assert (middle - edge).abs().mean() < 0.015

@@ -11,8 +11,9 @@ import pytest
 from aaplug_cli.main import main
 
 from aaplug.io.cameras.camera_path import CameraPath
-from aaplug.io.image_files import file_names
+from aaplug.io.image_files import FrameSequence, file_names
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import OutputError
 from tests.conftest import exit_code, make_camera
 
 WORDS = "video scene.ply --cameras . --scale 0.5 --seconds 0.2 -o"
@@ -114,7 +115,7 @@ REFUSED = {
     "v.mp4 --format exr": f"--format: {VIDEO}",
     "v.mp4 --lens fisheye": "--lens: fisheye sets its own angle, which zoom would change; give --path dolly or orbit",
     "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",
-    "##/a.png": "a.png: has a frame's number in a folder's name; give it to the file alone",
+    "##/a.png": "##/a.png: name a .webm or .mp4 file, or frames such as name.####.png",
     "a.####/b.####.png": "b.####.png: has a frame's number in a folder's name",
     "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",
     "a.##.png --beside mip": "--beside: is for videos of one eye; a frame sequence and vr180 show --recipe alone",
@@ -163,3 +164,11 @@ def test_a_kill_loses_no_finished_frame_and_the_rest_ends_the_same(cli, monkeypa
     cli.done(words.replace("out/", "whole/"))
     assert resumed == bytes_of("whole")
     assert len(resumed) == 7
+
+
+def test_places_for_a_number_in_a_folders_name_are_of_a_sequence_that_would_make_it(tmp_path):
+    (tmp_path / "q##").mkdir()
+    assert FrameSequence.of(tmp_path / "q##" / "v.webm", None) is None
+    assert FrameSequence.of(tmp_path / "q##" / "f.####.png", None) is not None
+    with pytest.raises(OutputError, match="has a frame's number in a folder's name"):
+        FrameSequence.of(tmp_path / "new##" / "f.####.png", None)

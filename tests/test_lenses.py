@@ -14,6 +14,7 @@ from aaplug import RULES_3DGS, Camera, Renderer, TrainingViews, UsageError
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
 from aaplug.core.light import transmittances
 from aaplug.core.projection import project, project_covariances, rotation_matrices
+from aaplug.core.splats import concatenated
 from aaplug.io.lenses import Distortion, undistorted, with_lenses
 from aaplug.io.photographs import read_photo
 from aaplug.methods.pixel_kernels.ray import RAY
@@ -150,9 +151,8 @@ def test_rays_of_places_are_the_rays_that_meet_them(lens):
     back = lens.rays(lens.places(rays))
     seen = back.abs().sum(dim=1) > 0
     assert seen.double().mean() > 0.8
-    torch.testing.assert_close(
-        torch.nn.functional.normalize(back, dim=1)[seen], torch.nn.functional.normalize(rays, dim=1)[seen]
-    )
+    found, expected = (torch.nn.functional.normalize(each, dim=1)[seen] for each in (back, rays))
+    assert (found - expected).abs().max() < 1e-13
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -183,9 +183,11 @@ def test_beyond_its_image_a_distorting_pinhole_is_no_steeper():
     assert spread.max() > 1.5 * spread[(camera.lens.places(points).abs() < 1).all(dim=1)].max(), "the margin counts"
 
 
-def test_the_light_of_splats_is_that_of_ellipses_of_the_image(lens, monkeypatch):
+@pytest.mark.parametrize("inside", [False, True], ids=["outside", "inside"])
+def test_the_light_of_splats_is_that_of_ellipses_of_the_image(lens, inside, monkeypatch):
     """Their gradients are compiled, and those of splats that a lens bends are not."""
-    scene, view, drawn = make_scene(200), replace(make_camera((0.0, -4.0, 0.0)), lens=lens), []
+    view = view_through(lens) if inside else replace(make_camera((0.0, -4.0, 0.0)), lens=lens)
+    scene, drawn = make_scene(200), []
 
     def seen(scene, view=view):
         renderer = Renderer.of(scene, [view], "matched", min_seen=0.0)
@@ -196,7 +198,7 @@ def test_the_light_of_splats_is_that_of_ellipses_of_the_image(lens, monkeypatch)
 
         return transmittances(renderer.splats(view), view, 1 / 255, paint)
 
-    assert seen(replace(scene[:40], logit_opacities=torch.full((40,), -3.0))).nanquantile(0.05) > 0.95, "all is seen"
+    assert seen(replace(scene[:40], logit_opacities=torch.full((40,), -3.0))).nanquantile(0.05) > 0.9, "all is seen"
     found = seen(scene)
     narrow = seen(scene, replace(view, lens=replace(lens, max_angle=10.0)))
     assert lens == ORTHO or narrow.isnan().sum() > found.isnan().sum() + 20, "of what the lens does not see"
@@ -204,9 +206,8 @@ def test_the_light_of_splats_is_that_of_ellipses_of_the_image(lens, monkeypatch)
     monkeypatch.setattr("aaplug.core.light.in_image", lambda splats: splats)
     bent = seen(scene)
     assert bent.nanquantile(0.1) < 0.6
-    if not lens.distorts or not lens.flat:  # a plane's pixels have the area of the image's
-        assert torch.equal(found.isnan(), bent.isnan())
-        assert (found - bent).abs().nanmean() < 0.003
+    assert torch.equal(found.isnan(), bent.isnan())
+    assert (found - bent).abs().nanmean() < (0.1 if inside else 0.003 if not lens.flat else 0.02)
 
 
 def test_a_lens_ends_where_its_radial_map_turns_back():
@@ -289,14 +290,18 @@ def test_tiles_draw_through_a_lens_what_the_reference_does(lens):
 
 def test_bounds_are_found_once_and_forgotten_where_splats_change(lens, monkeypatch):
     renderer = Renderer.of(make_scene(60), [view_through(lens)], "matched", min_seen=0.0)
-    splats = renderer.splats(view_through(lens))
-    again = RAY.bounding_ellipses(replace(splats, reach=None), RULES_3DGS)
-    assert splats.bounds is not None
+    splats, how = renderer.splats(view_through(lens)), (RAY, RULES_3DGS)
+    found, again = splats.bounds(*how), RAY.bounding_ellipses(splats, RULES_3DGS)
+    assert found is not None
     for name in ("means", "covs", "dets", "opacities"):
-        torch.testing.assert_close(getattr(splats.bounds, name), getattr(again, name), rtol=1e-4, atol=1e-3)
-    assert torch.equal(splats[3:7].bounds.covs, splats.bounds.covs[3:7])
-    assert splats.with_columns({"rgb": 2 * splats.rgb}).bounds is not None
-    assert splats.blurred(0.1, compensate=True).bounds is None
+        torch.testing.assert_close(getattr(found, name), getattr(again, name), rtol=1e-4, atol=1e-3)
+    assert torch.equal(splats[3:7].bounds(*how).covs, found.covs[3:7])
+    assert splats.with_columns({"rgb": 2 * splats.rgb}).bounds(*how) is not None
+    assert concatenated([splats[:3], splats[3:]]).bounds(*how) is not None
+    assert concatenated([replace(splats[:3]), splats[3:]]).bounds(*how) is None
+    assert splats.bounds(RAY, replace(RULES_3DGS, min_alpha=0.003)) is None
+    for changed in (splats.blurred(0.1, compensate=True), replace(splats, opacities=splats.opacities / 2)):
+        assert changed.bounds(*how) is None
     monkeypatch.setattr(type(RAY), "bounding_ellipses", lambda *_: pytest.fail("a second time"))
     renderer.paint(splats, (64, 64))
 

@@ -186,7 +186,7 @@ class Camera:
         return replace(self, trained_focal=self.focal)
 
     def straight(self) -> "Camera":
-        """This view as a pinhole of the same focal lengths if its lens is a pinhole that distorts, else unchanged."""
+        """This view as a pinhole of the same focal lengths if its lens is a distorted pinhole, else unchanged."""
         return replace(self, lens=PINHOLE) if self.lens.flat and self.lens.distorts else self
 
     def _moved(self, width: int, height: int, x: float, y: float, at: Point = CORNER, to: Point = CORNER) -> "Camera":

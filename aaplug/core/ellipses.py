@@ -81,16 +81,12 @@ def cull(
     """The splats that can change an image of height and width `hw` px; a splat without area cannot.
 
     margin: cull splats whose centre lies farther outside the image than this share of its longer side.
-    ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own; they become
-        their `reach`.
+    ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
     """
     size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw), rules.min_alpha])
     bounds = splats if ellipses is None else ellipses
     columns = bounds.means, bounds.covs, bounds.dets, bounds.opacities
     (inside,) = kernels.run(CULL, *columns, size)
-    if ellipses is not None:
-        reach = bounds.means - splats.means, bounds.covs, bounds.dets[:, None], bounds.opacities[:, None]
-        splats = splats.with_columns({"reach": torch.cat(reach, dim=1).detach()})
     return splats.selected(inside.bool().nonzero().squeeze(1))
 
 

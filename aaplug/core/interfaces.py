@@ -156,8 +156,8 @@ class PixelKernel(Protocol):
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m_and_1 c"]:
         """One row per splat, with the colour and everything that `alpha` reads, then one padding row.
 
-        The padding row's alpha is 0 everywhere: tiles that have run out of splats read it.  `raster_rows.rows_of`
-        appends it.
+        Colours are differences from the background, and so may be negative.  The padding row's alpha is 0 everywhere:
+        tiles that have run out of splats read it.  `raster_rows.rows_of` appends it.
         """
         ...
 

@@ -56,16 +56,19 @@ def transmittances(splats: Splats2D, camera: Camera, min_alpha: float, paint: Pa
 def in_image(splats: Splats2D) -> Splats2D:
     """Splats in planes of their own as ellipses of the image: the lens is linearised at each centre.
 
-    One whose centre it does not see has the opacity 0.
+    Pinholes that distort bend splats little, and are steep beyond their image: theirs keep their shapes.  Splats whose
+    centre the lens does not see have the opacity 0.
     """
     camera, planes = splats.camera, splats.planes
     if camera is None or planes is None:
         return splats
     (along, middles), lens = plane_rays(planes), camera.lens
-    by_place = lens.derivatives(middles) @ along * along.new_tensor([[camera.fx], [camera.fy]])
-    covs = by_place @ splats.covs[:, [[0, 1], [1, 2]]] @ by_place.mT
-    dets, seen = splats.dets * torch.linalg.det(by_place).square(), lens.rays(lens.places(middles)).any(dim=1)
-    columns = {"covs": covs.flatten(1)[:, [0, 1, 3]], "dets": dets, "opacities": splats.opacities * seen}
+    columns = {"opacities": splats.opacities * lens.rays(lens.places(middles)).any(dim=1)}
+    if not lens.flat:
+        by_place = lens.derivatives(middles) @ along * along.new_tensor([[camera.fx], [camera.fy]])
+        covs = by_place @ splats.covs[:, [[0, 1], [1, 2]]] @ by_place.mT
+        dets = splats.dets * torch.linalg.det(by_place).square()
+        columns |= {"covs": covs.flatten(1)[:, [0, 1, 3]], "dets": dets}
     return replace(splats.with_columns(columns), planes=None, camera=None)
 
 
@@ -78,9 +81,6 @@ def lights(splats: Splats2D, camera: Camera, min_alpha: float, paint: Paint) -> 
     least = LEAST_SEEN * camera.exposure.samples ** (1 / 3)
     seen = transmittances(splats, camera, min_alpha, paint)
     seen = torch.where(seen.isnan(), seen.nanmean().nan_to_num(1.0), seen).clamp(min=least)
-    if (copies := splats.are_copies).any():  # each has its original's
-        shares = seen.new_zeros(int(splats.sources.max()) + 1).index_copy_(0, splats.sources[~copies], seen[~copies])
-        seen = shares[splats.sources]
     spread, opacities = spread_out(splats, camera, seen)
     cover = -torch.log1p(-paint(spread).alpha.clamp(max=1.0))
     x, y = (splats.means.long().clamp(min=0).minimum(splats.sources.new_tensor([camera.width, camera.height]) - 1)).T

@@ -6,7 +6,7 @@ correct digit for a needle, computed from the factors of the projection it has a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -19,7 +19,7 @@ from aaplug.system.errors import UsageError
 
 MIN_COMPENSATION = 0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS)
 NEARER, FARTHER = 0.25, 0.12  # shares of the change of depth along a ray that count where it is negative, or positive
-SHAPE = frozenset(("covs", "dets", "opacities"))  # columns that decide what bounds a splat
+SHAPE = frozenset(("covs", "dets", "opacities", "depth_slopes", "planes"))  # columns that decide what bounds a splat
 Floor = Annotated[float, Range(0, 1)]
 
 
@@ -37,7 +37,7 @@ class Splats2D:
         right, down and ahead.  A ray d meets the plane right·d / ahead·d and down·d / ahead·d px from the centre.
     rates: at which the view samples each splat, in px per world unit.
     reach: x and y of the centre from the splat's own, packed covariance, determinant and opacity of the ellipse that
-        bounds it, where a pixel kernel shows more than the splat's own; culling adds it.  See `bounds`.
+        bounds it for a pixel kernel and rules, `bounded_for`; see `bounds`.
     """
 
     means: Float[Tensor, "m 2"]
@@ -52,8 +52,9 @@ class Splats2D:
     window: float = 1.0
     planes: Float[Tensor, "m 3 3"] | None = None
     rates: Float[Tensor, " m"] | None = None
-    reach: Float[Tensor, "m 7"] | None = None
     camera: Camera | None = None
+    reach: Float[Tensor, "m 7"] | None = field(default=None, init=False)  # which `replace` forgets
+    bounded_for: tuple[object, ...] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -68,10 +69,18 @@ class Splats2D:
             return torch.zeros_like(self.sources, dtype=torch.bool)
         return (self.means[:, 0] - self.camera.cx).abs() > self.camera.fx * self.camera.lens.period / 2
 
-    @property
-    def bounds(self) -> "Splats2D | None":
-        """The bounding ellipses that culling found; None if it found none, or the splats have changed since."""
-        if self.reach is None:
+    def bounded_by(self, ellipses: "Splats2D | None", *bounded_for: object) -> "Splats2D":
+        """The same splats, which know their bounding ellipses for a pixel kernel and rules."""
+        if ellipses is None:
+            return self
+        reach = ellipses.means - self.means, ellipses.covs, ellipses.dets[:, None], ellipses.opacities[:, None]
+        known = self.with_columns({"reach": torch.cat(reach, dim=1).detach()})
+        vars(known)["bounded_for"] = bounded_for
+        return known
+
+    def bounds(self, *bounded_for: object) -> "Splats2D | None":
+        """The bounding ellipses for a pixel kernel and rules, if they are known and the splats have not changed."""
+        if self.reach is None or self.bounded_for != bounded_for:
             return None
         means, covs, (dets, opacities) = self.reach[:, :2], self.reach[:, 2:5], self.reach[:, 5:].unbind(dim=1)
         return self.with_columns({"means": self.means + means, "covs": covs, "dets": dets, "opacities": opacities})
@@ -97,7 +106,7 @@ class Splats2D:
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""
         columns = self._columns().items()
-        return replace(self, **{n: c.to(dtype) for n, c in columns if c.is_floating_point()})
+        return self.with_columns({n: c.to(dtype) for n, c in columns if c.is_floating_point()})
 
     @contract
     def blurred(
@@ -159,8 +168,9 @@ def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
     """The splats of several parts as one; every part has the same columns."""
     if len(parts) == 1:
         return parts[0]
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in parts[0]._columns()}
-    return replace(parts[0], **columns)
+    if any(part.reach is None for part in parts):
+        parts = [replace(part) for part in parts]
+    return parts[0].with_columns({n: torch.cat([getattr(part, n) for part in parts]) for n in parts[0]._columns()})
 
 
 class Render(NamedTuple):

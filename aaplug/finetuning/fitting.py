@@ -39,7 +39,7 @@ def fit(
     """A scene for a viewer, and original, closed form and result as it shows them; raises as `fuse_for` and `tune` do.
 
     look: draws the scene as training showed it, which the viewer should show.
-    views: to measure on; a few of them are taken.  These and the training views are straight, as viewers draw them.
+    views: to measure on; a few of them are taken.  Those of cameras that distort are straight, as viewers draw them.
     steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)

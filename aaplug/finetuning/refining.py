@@ -140,7 +140,7 @@ def _tuned(job: TuningJob, shown_by: str, monitor: Monitor) -> Gaussians:
 def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tuple[list[Camera], list[Camera]]:
     """Views to tune on, one a step and as many as fit into memory at all scales, and probes of the training size.
 
-    They are straight: viewers draw no others, and gradients through a lens are not compiled.
+    Those of cameras that distort are straight: viewers draw no others, and gradients through a lens are not compiled.
     """
     poses = [pose.straight() for pose in spread(poses, MAX_POSES)]
     sizes = [size for size in VIEW_SIZES if size * scales[0] <= 1] or [1.0]

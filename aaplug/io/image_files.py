@@ -75,10 +75,10 @@ class FrameSequence:
         Raises OutputError if the name has places for more than one number or is that of no format, and for places in
         a folder's name.
         """
-        if SEVERAL in str(output.parent):
-            raise OutputError(output, "has a frame's number in a folder's name; give it to the file alone")
         if not PLACES.search(output.name):
             return None if format is None or names_image(output) else cls(output / f"{USUAL_NAME}.{format}")
+        if SEVERAL in str(output.parent) and not output.parent.is_dir():
+            raise OutputError(output, "has a frame's number in a folder's name; give it to the file alone")
         if len(PLACES.findall(output.name)) > 1:
             raise OutputError(output, "has places for two numbers; name a sequence such as frame.####.exr")
         if output.suffix.lower() not in SUFFIXES:

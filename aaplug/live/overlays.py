@@ -4,7 +4,7 @@ h, w: of the picture, in px.  A value that nothing decides, such as the sampling
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -76,7 +76,8 @@ def _cost(renderer: Renderer, camera: Camera, samples: int) -> Map:
     fine = camera.resized(camera.width * samples, camera.height * samples)
     splats, rules = renderer.splats(fine, samples), renderer.training.convention.rules
     grid = -(-fine.height // TILE), -(-fine.width // TILE)
-    ellipses = renderer.recipe.pixel.bounding_ellipses(splats, rules) or splats
+    pixel = renderer.recipe_through(splats.camera).pixel
+    ellipses = splats.bounds(pixel, rules) or pixel.bounding_ellipses(splats, rules) or splats
     counts = torch.cat([bins.counts for bins in bands(ellipses, grid, renderer.kernels, rules=rules)]).view(grid)
     rows, columns = (((torch.arange(side) + 0.5) * samples / TILE).long() for side in camera.hw)
     return counts[rows][:, columns].float() * samples**2
@@ -91,7 +92,7 @@ def _blended(renderer: Renderer, camera: Camera, of_training: Callable[[Tensor, 
     seen = renderer.training.bounds.seen[splats.sources].to(splats.depths)
     values = torch.where(seen > 0, of_training(splats.depths, splats.sources).to(seen), 0.0)
     colours = torch.stack([values, seen, torch.ones_like(seen)], dim=1)
-    total, seen_alpha, _ = renderer.paint(replace(splats, rgb=colours), camera.hw, BLACK).rgb.unbind(dim=2)
+    total, seen_alpha, _ = renderer.paint(splats.with_columns({"rgb": colours}), camera.hw, BLACK).rgb.unbind(dim=2)
     return torch.where(seen_alpha > MIN_SEEN_ALPHA, total / seen_alpha, torch.nan)
 
 

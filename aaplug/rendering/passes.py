@@ -17,7 +17,6 @@ Where nothing is, an id is -1 and everything else 0.  m: splats; h, w: px of the
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -126,7 +125,7 @@ def composited(
     width = channels.shape[1]
     at_once = min(per_call, key=lambda count: -(-width // count))
     parts = pad(channels, (0, -width % at_once)).split(at_once, dim=1)
-    images = [draw(replace(splats, rgb=part)) for part in parts]
+    images = [draw(splats.with_columns({"rgb": part})) for part in parts]
     planes = [image.rgb.movedim(2, 0) for image in images]  # as they lie in memory
     planes[-1] = planes[-1][: width - at_once * (len(planes) - 1)]
     return Render(torch.cat(planes).movedim(0, 2), images[0].alpha)

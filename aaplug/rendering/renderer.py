@@ -435,8 +435,8 @@ class Renderer:
                 parts.append(shade(splats, self.scene, camera, self.kernels))
                 continue
             chunk = replace(chunk, sh=self.harmonics(start, start + len(chunk)))
-            local = replace(splats, sources=splats.sources - start)
-            parts.append(replace(shade(local, chunk, camera, self.kernels), sources=splats.sources))
+            local = splats.with_columns({"sources": splats.sources - start})
+            parts.append(shade(local, chunk, camera, self.kernels).with_columns({"sources": splats.sources}))
         splats = concatenated(parts)
         if self.recipe.order == "tile":
             splats = with_ray_slopes(splats, self.scene, camera)
@@ -500,6 +500,7 @@ class Renderer:
         if camera.exposure is not None:
             splats, _ = spread_out(splats, camera, None if light is None else light.index_select(0, splats.sources))
         ellipses = asked("pixel kernel", recipe.pixel, "bounding_ellipses", splats, rules)
+        splats = splats.bounded_by(ellipses, recipe.pixel, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
 
     @property

@@ -41,7 +41,7 @@ def strips(
         if seen is not None:
             seen = replace(seen, cx=seen.cx - x, cy=seen.cy - y, height=hw[0], width=hw[1])
         moved = replace(splats, means=splats.means - splats.means.new_tensor([x, y]), camera=seen)
-        ellipses = moved.bounds or pixel.bounding_ellipses(moved, rules)
+        ellipses = pixel.bounding_ellipses(moved, rules)
         visible = cull(moved, hw, kernels=renderer.kernels, ellipses=ellipses, rules=rules)
         strip = average_samples(renderer.paint(visible, hw), samples, weight)
         inner = slice(top - above, top - above + rows), slice(left - start, right - start)

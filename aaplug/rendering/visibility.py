@@ -39,5 +39,7 @@ def visibility(
             splats = look.splats(camera)
         paint = partial(look.paint, hw=camera.hw, background=BLACK)
         share = transmittances(splats, camera, look.training.convention.rules.min_alpha, paint).nan_to_num(-1.0)
-        shares[splats.sources] = torch.maximum(shares[splats.sources], share.to(shares))
+        originals = ~splats.are_copies
+        rows, share = splats.sources[originals], share[originals].to(shares)
+        shares[rows] = torch.maximum(shares[rows], share)
     return shares.where(shares >= 0, torch.nan)

@@ -125,7 +125,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
 
             if sequence is not None:
                 left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
-                if options.resume:
+                if len(left) < len(views):
                     job.monitor.say(f"resumed with {len(views) - len(left)} of {counted(len(views), 'frame')}")
                 paths, cameras_left = [sequence.paths[place] for place in left], [views[place] for place in left]
                 tell_left = tell_after(len(views) - len(left))

@@ -130,7 +130,7 @@ def draws_the_exact_image(pixel: PixelKernel) -> None:
         values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
         xx, xy, yy = values["covs"].unbind(dim=1)
         # with determinants made of the covariances: kernels may read either
-        image = rasterizer(replace(splats, **values, dets=xx * yy - xy * xy), (17, 26), BLACK, pixel)
+        image = rasterizer(replace(splats, **values, dets=xx * yy - xy * xy), (17, 26), SKY, pixel)
         gradients.append(torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values())))
     for name, tiled, exact in zip(names, *gradients, strict=True):
         require(exact.abs().max() > 0, f"the gradient of {name} is 0")

@@ -174,7 +174,7 @@ def with_copies(splats: Splats2D, rules: Rules) -> Splats2D:
     if camera is None or not camera.lens.period:
         return splats
     turn = camera.fx * camera.lens.period
-    ellipses, parts = splats.bounds or RAY.bounding_ellipses(splats, rules), [splats]
+    ellipses, parts = splats.bounds(RAY, rules) or RAY.bounding_ellipses(splats, rules), [splats]
     assert ellipses is not None
     cutoff = squared_cutoff(ellipses.opacities, rules.min_alpha).clamp(min=0)
     half = (cutoff * ellipses.covs[:, 0]).sqrt()

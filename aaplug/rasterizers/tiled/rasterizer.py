@@ -72,7 +72,7 @@ class Tiled:
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         if grid == (1, 1):
             grid = (1, MIN_TILES)  # a lone tile would be drawn eagerly
-        ellipses = splats.bounds or pixel.bounding_ellipses(splats, rules) or splats
+        ellipses = splats.bounds(pixel, rules) or pixel.bounding_ellipses(splats, rules) or splats
         if compositor is None:
             assert splats.rgb is not None
             channels = splats.rgb.shape[1]
